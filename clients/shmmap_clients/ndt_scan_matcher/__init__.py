@@ -9,10 +9,10 @@
     matcher.set_map(VoxelMap({"map": voxel_cell(points, leaf=2.0)}))
     result = matcher.align(scan, T_guess)
 
-The same result as Autoware's, ndt_omp's or PCL's program, by the chosen variant; see `Settings`.
+The chosen variant gives the same result as the program of Autoware, ndt_omp or PCL; see `Settings`.
 
 To follow one alignment read ``matching/matcher.py``, ``matching/newton.py``, ``backends/numba_backend.py``,
-``backends/kernels.py``, ``matching/result.py``; it also enters ``matching/evaluation.py`` (pose vectors),
+``backends/kernels.py``, ``matching/result.py``.  It also calls ``matching/evaluation.py`` (pose vectors),
 ``map/voxel_map.py`` (the kernel's table) and ``backends/backend.py`` (the scan's buffer).
 """
 

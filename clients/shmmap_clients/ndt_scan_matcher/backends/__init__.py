@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What evaluates scores and derivatives."""
+"""Backends that evaluate scores and derivatives."""

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`Backend`: what computes score and derivatives, one small contract for several kinds of hardware.
+"""`Backend`: the interface of all that compute score and derivatives, on any kind of hardware.
 
-Beside it stands what backends have in common: the scan's buffer, the options of a device, the count of what
-was written to one, and what can be wrong with it.  After none of these errors is another device taken
+This module also has what backends share: the scan's buffer, the options of a device, the counts of bytes
+written to a device, and the errors of devices.  None of these errors makes another device take over
 silently::
 
     DeviceError
-    ├── NoDevice           no driver, no such device, or it cannot do what was asked
+    ├── NoDevice           no driver, no such device, or the device lacks a required feature
     ├── KernelBuildFailed  the driver refuses the program
-    ├── DeviceMemory       the device has not the memory that the limits ask for
-    └── DeviceHung         it did not answer in time
+    ├── DeviceMemory       the device has less memory than the limits require
+    └── DeviceHung         the device did not answer in time
 """
 
 from __future__ import annotations
@@ -55,18 +55,18 @@ _LESS: Final = "lower limits (--max-voxels, --max-map-bytes, --max-points) need 
 
 @dataclass(frozen=True, slots=True)
 class DeviceOptions:
-    """For backends that compute on a device; the others ignore it.
+    """Options of backends that compute on a device; other backends ignore them.
 
     Attributes
     ----------
     device
-        Index or part of the name, as ``shmmap-ndt devices`` lists them; None: what the variable
-        ``SHMMAP_OPENCL_DEVICE`` says, or the first GPU, else the first device.
+        Index or part of the name, as ``shmmap-ndt devices`` lists them.  None: the value of the variable
+        ``SHMMAP_OPENCL_DEVICE``, or the first GPU, or else the first device.
     precision
-        ``"auto"``: double where the device has it.
+        ``"auto"``: double where the device supports it.
     memory
-        ``"svm"``: shared segments are read where they lie; ``"copy"``: each map is copied to the device;
-        ``"auto"``: the first where the device says that it can (``CL_DEVICE_SVM_FINE_GRAIN_SYSTEM``).
+        ``"svm"``: the device reads shared segments in place; ``"copy"``: each map is copied to the device;
+        ``"auto"``: ``"svm"`` where the device reports support (``CL_DEVICE_SVM_FINE_GRAIN_SYSTEM``).
     """
 
     device: str | None = None
@@ -84,16 +84,16 @@ class DeviceOptions:
 
 @dataclass(slots=True)
 class UploadStatistics:
-    """What was written to a device for maps; all zero where maps are read where they lie.
+    """Counts of writes of maps to a device; all zero where the device reads maps in place.
 
     Attributes
     ----------
     written_bytes
-        With the gaps between arrays.
+        Bytes written, including the gaps between arrays.
     writes
-        One for each map and kind of covariance.
+        Number of writes: one for each map and kind of covariance.
     laid_out_again
-        Maps that were written again because two kinds of covariance had no room side by side.
+        Maps that were written again because the buffer had no room for two kinds of covariance.
     """
 
     written_bytes: int = 0
@@ -104,59 +104,59 @@ class UploadStatistics:
 class Backend(Protocol):
     """Evaluates poses of one scan against one map.
 
-    An implementation allocates what the limits allow when it is made, and nothing that grows later.
+    An implementation allocates all memory that the limits allow in its constructor; nothing grows later.
     One object serves one thread at a time.
     """
 
     @property
     def name(self) -> str:
-        """As in `BACKENDS`."""
+        """Name of the backend, a key of `BACKENDS`."""
 
     @property
     def on_device(self) -> bool:
-        """Whether the work is done elsewhere than in the threads of this process."""
+        """Whether a device does the work, not the threads of this process."""
 
     @property
     def fault(self) -> DeviceError | None:
-        """Why another backend than the one that was asked for computes; None if it does not."""
+        """Reason why the fallback computes instead of the requested backend; None if it does not."""
 
     max_map_bytes: int
-    """Of a map, see `Limits.map_bytes`: less than the limit where a device has not as much memory."""
+    """Largest map, see `Limits.map_bytes`: below that limit where a device has less memory."""
 
     @property
     def uploads(self) -> UploadStatistics:
-        """Counts of what was written to a device for maps; always the same object, which is updated."""
+        """Counts of writes of maps to a device; always the same object, updated in place."""
 
     def prepare(self, voxel_map: VoxelMap, scoring: Scoring) -> None:
         """Prepare this map, so that evaluations with it need not wait.
 
-        It may be called in another thread, beside evaluations with the map in use.
+        Another thread may call it while evaluations use the current map.
         """
 
     def set_map(self, voxel_map: VoxelMap) -> None:
-        """Match against this map from now on; it is kept alive until the next."""
+        """Match against this map from now on; keep a reference to it until the next call."""
 
     def set_source(self, points: NDArray[np.floating]) -> int:
-        """Take a scan, (N, 3), metres, sensor or base frame; returns how many points the limit left out."""
+        """Store a scan, (N, 3), metres, sensor or base frame; return the number of points above the limit."""
 
     def evaluate(self, poses: NDArray[np.float64], scoring: Scoring) -> list[Evaluation]:
         """Return score, gradient and Hessian at each of (k, 6) pose vectors; k up to the limit.
 
-        A pose has the same bits alone and among others.
+        The result of a pose is the same to the bit, whichever other poses are in the batch.
 
         Raises
         ------
         BadRequest
-            There are more poses than the limit.
+            The number of poses exceeds the limit.
         DeviceError
-            A device failed, or has not answered at the scoring's deadline.
+            A device failed, or did not answer before the scoring's deadline.
         """
 
     def step(self, at: Evaluation, steady: bool, /) -> NDArray[np.float64]:
-        """Return the step that an evaluation asks for: `upward_step` if steady, else `newton_step`."""
+        """Return the next step from an evaluation: `upward_step` if steady, else `newton_step`."""
 
     def close(self) -> None:
-        """Give back threads and memory; a hung device is not waited for."""
+        """Release threads and memory, without waiting for a hung device."""
 
 
 def check_batch(poses: NDArray[np.float64], most: int) -> None:
@@ -166,7 +166,7 @@ def check_batch(poses: NDArray[np.float64], most: int) -> None:
 
 
 class ScanBuffer:
-    """Room for a scan of at most ``most`` points, as numbers of ``dtype``."""
+    """Buffer for a scan of at most ``most`` points of type ``dtype``."""
 
     def __init__(self, most: int, dtype: np.dtype[Any] | type = np.float64) -> None:
         self._buffer: NDArray[Any] = np.empty((most, 3), dtype)
@@ -178,10 +178,10 @@ class ScanBuffer:
         return self._buffer[: self._count]
 
     def take(self, points: NDArray[np.floating]) -> int:
-        """Take a scan; returns how many points were left out.
+        """Store a scan; return the number of points left out.
 
-        Point i of the kept m is floor(i n / m) of the given n: the same ones each time, and evenly over
-        the whole scan, whatever its order.  Points that are not finite find no neighbour.
+        Of n points, m are kept: point i of these is number floor(i n / m) of the scan.  The choice is
+        deterministic and even over the whole scan.  Points that are not finite find no neighbour.
         """
         if points.ndim != 2 or points.shape[1] != 3:
             raise BadRequest(f"a scan must have shape (N, 3), this one has {points.shape}")
@@ -197,7 +197,7 @@ class ScanBuffer:
 
 
 class DeviceError(ShmmapError):
-    """A device cannot do what it is asked to."""
+    """A device failed or cannot be used."""
 
     code = "device_error"
     exit_code = 69
@@ -205,7 +205,7 @@ class DeviceError(ShmmapError):
 
 
 class NoDevice(DeviceError):
-    """There is no such device, or it cannot do what was asked."""
+    """There is no such device, or it lacks a required feature."""
 
     code = "no_device"
 
@@ -217,7 +217,7 @@ class KernelBuildFailed(DeviceError):
 
 
 class DeviceMemory(DeviceError):
-    """The device has not as much memory as the limits ask for."""
+    """The device has less memory than the limits require."""
 
     code = "device_memory"
 
@@ -230,14 +230,14 @@ class DeviceHung(DeviceError):
 
 @contextmanager
 def device_errors(device: str, what: str) -> Iterator[None]:
-    """Turn pyopencl's errors, and a lack of memory, into those of this module.
+    """Translate errors of pyopencl, and a lack of memory, into errors of this module.
 
     Parameters
     ----------
     device
         The device's name.
     what
-        What is asked of it, as in "device X cannot ...".
+        The operation, as in "device X cannot ...".
     """
     import pyopencl as cl
 
@@ -251,7 +251,7 @@ def device_errors(device: str, what: str) -> Iterator[None]:
                 hint=_LESS,
             ) from None
         raise DeviceError(f"device {device!r} cannot {what}: {said}") from None
-    except MemoryError as error:  # of this process, which a processor's memory is
+    except MemoryError as error:  # a processor as device uses the memory of this process
         raise DeviceMemory(
             f"device {device!r} has not enough memory to {what}: {error}", hint=_LESS
         ) from None

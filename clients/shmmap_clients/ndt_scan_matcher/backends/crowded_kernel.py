@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a point's neighbours come to where they are more than the limit; and the exponential of all."""
+"""Sum over the nearest neighbours of a point that has more than the limit; and the kernels' exponential."""
 
 from __future__ import annotations
 
@@ -27,18 +27,16 @@ MAP: Final = (
 )
 SCRATCH: Final = (types.float64[:, ::1], types.int64[::1])  # near, near_inverse
 _CROWD: Final = types.void(
-    *[types.float64] * 3,  # the point, map frame
-    *[types.int64] * 3,  # its place in the directory's lattice
+    *[types.float64] * 3,  # point, map frame
+    *[types.int64] * 3,  # lattice index of the point
     *MAP,
     *SCRATCH,
-    types.float64[::1],  # what the neighbours come to
+    types.float64[::1],  # sum over the neighbours
 )
 
-# exp(-x) = 2^-n exp(n ln 2 - x): half a unit in the last place, and no call that spills every register
+# exp(-x) = 2^-n exp(n ln 2 - x): error of half a unit in the last place, and no call that spills registers
 _LOG2E: Final = 1.4426950408889634
-_LN2_HIGH: Final = (
-    6.93147180369123816490e-01  # of few bits, so that its multiples are exact (fdlibm, e_exp.c)
-)
+_LN2_HIGH: Final = 6.93147180369123816490e-01  # few bits, so that its multiples are exact (fdlibm, e_exp.c)
 _LN2_LOW: Final = 1.90821492927058770002e-10
 _POWERS: Final = 2.0 ** -np.arange(56.0)
 
@@ -82,9 +80,9 @@ def add_nearest(
     near_inverse: Any,
     crowd: Any,
 ) -> None:
-    """Sum the nearest neighbours of a point that has more than there is room for; seldom called.
+    """Sum the nearest neighbours of a point that has more than the limit; seldom called.
 
-    ``crowd`` gets score, best share, g (3), h (6).
+    Writes score, best share, g (3) and h (6) to ``crowd``.
     """
     most = near.shape[0]
     count = 0

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The compiled loops: neighbours, score, gradient and Hessian in one pass over the points; work once a pose.
+"""The compiled loops: neighbours, score, gradient and Hessian in one pass over the points; work per pose.
 
-Importing this module compiles the kernels, or loads them from numba's cache (tenths of a second).
+Importing this module compiles the kernels, or loads them from numba's cache within tenths of a second.
 
-Everything that the loop over points reads repeatedly is in local variables: a compiler that cannot know
-that a store does not change an array would load it again each time.  So that loop is one long function.
+The loop over points keeps all values that it reads repeatedly in local variables: a compiler that cannot
+exclude aliasing would reload them from the arrays after each store.  So the loop is one long function.
 
-Work done once a pose (the rotation's derivatives, the sum of the points' parts, the next step) is compiled,
-too.  In Python it would be some hundred small operations, whose code has left the processor's caches by the
-time of the next scan.
+Work done once per pose (derivatives of the rotation, sum over the points, the next step) is compiled, too.
+In Python this would be about a hundred small operations, and their code would no longer be in the
+processor's caches at the next scan.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _SIGNATURE: Final = types.void(
     types.float64[:, ::1],  # rows
 )
 CONTRACTED: Final = 48  # score, nearest, four counts; gradient; Hessian
-_SWEEPS: Final = 30  # of Jacobi's method; six are enough for any matrix of six rows
+_SWEEPS: Final = 30  # limit for Jacobi's method; six are enough for any matrix of six rows
 _EPSILON: Final = float(np.finfo(np.float64).eps)
 _TINY: Final = float(np.finfo(np.float64).tiny)
 _DERIVE: Final = types.void(
@@ -55,7 +55,7 @@ _CONTRACT: Final = types.void(
     read_only(types.float64, 2),  # rows
     types.int64,  # chunks of the source
     read_only(types.float64, 4),  # M
-    types.float64[:, ::1],  # what they come to
+    types.float64[:, ::1],  # contracted sums of each pose
 )
 _STEP: Final = types.void(
     read_only(types.float64, 2),  # Hessian
@@ -113,7 +113,7 @@ def accumulate(
         m200, m201 = M[pose, 2, 0, 0], M[pose, 2, 0, 1]
         m210, m211 = M[pose, 2, 1, 0], M[pose, 2, 1, 1]
         m220, m221 = M[pose, 2, 2, 0], M[pose, 2, 2, 1]
-        known = -1  # the cell of which the table's row is at hand
+        known = -1  # cell whose table row is in local variables
         lattice = mean = inverses = voxels = np.int64(0)
         i0 = j0 = k0 = nk = si = sj = sk = np.int64(0)
         ox = oy = oz = 0.0
@@ -138,7 +138,7 @@ def accumulate(
             fi = np.floor(px * inverse_leaf) - box_i
             fj = np.floor(py * inverse_leaf) - box_j
             fk = np.floor(pz * inverse_leaf)
-            # outside, or not a number; also keeps the conversions to integers defined
+            # outside the map or not a number; this test also keeps the conversions to integers defined
             if not (fi >= -1 and fi <= ni and fj >= -1 and fj <= nj and abs(fk) < 2**30):
                 continue
             i = np.int64(fi)
@@ -330,13 +330,13 @@ def accumulate(
 
 
 def loaded_from_cache() -> bool:
-    """Whether the kernel came from numba's cache, not from the compiler."""
+    """Return whether the kernel was loaded from numba's cache, not compiled."""
     return bool(accumulate.stats.cache_hits)  # type: ignore[attr-defined]
 
 
 @compiled(_DERIVE, boundscheck=False)
 def derive(poses: Any, pitch_sign: Any, T: Any, M: Any) -> None:
-    """Write each pose's matrix, and its `derivatives_of_poses`, at the beginning of T and M."""
+    """Write each pose's matrix to T and its `derivatives_of_poses` to M, from row 0."""
     for pose in range(poses.shape[0]):
         roll, pitch, yaw = poses[pose, 3], poses[pose, 4], poses[pose, 5]
         cx, sx = math.cos(roll), math.sin(roll)
@@ -403,7 +403,7 @@ def derive(poses: Any, pitch_sign: Any, T: Any, M: Any) -> None:
 
 @compiled(_CONTRACT, boundscheck=False)
 def contract(rows: Any, chunks: Any, M: Any, found: Any) -> None:
-    """Add each pose's rows in their order, and write what they come to, see `evaluations_of`."""
+    """Add each pose's rows in order, and write the contracted sums, see `evaluations_of`."""
     sums = np.empty(39)
     rotation = np.empty(9)
     for pose in range(found.shape[0]):
@@ -434,9 +434,9 @@ def contract(rows: Any, chunks: Any, M: Any, found: Any) -> None:
 
 @inlined
 def _diagonalize(a: Any, v: Any) -> None:
-    """Turn the symmetric ``a`` into a diagonal of its eigenvalues; columns of ``v`` become its eigenvectors.
+    """Diagonalize the symmetric ``a`` in place; the columns of ``v`` become its eigenvectors.
 
-    ``v`` is the identity before.  Jacobi's method has them to the last digits also where translations and
+    ``v`` must be the identity.  Jacobi's method is accurate to the last digits even where translations and
     rotations differ by orders of magnitude (Demmel and Veselic 1992).
     """
     for _ in range(_SWEEPS):
@@ -472,9 +472,9 @@ def _diagonalize(a: Any, v: Any) -> None:
 
 @compiled(_STEP, boundscheck=False)
 def step_into(hessian: Any, gradient: Any, steady: Any, step: Any) -> None:
-    """Write `upward_step` if steady, else `newton_step`.
+    """Write the next step: `upward_step` if steady, else `newton_step`.
 
-    A symmetric matrix's singular values are its eigenvalues' magnitudes: both steps come from these.
+    Singular values of a symmetric matrix are the magnitudes of its eigenvalues, which give both steps.
     """
     a = hessian.copy()
     v = np.eye(6)

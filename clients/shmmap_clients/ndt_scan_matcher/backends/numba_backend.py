@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The compiled backend: no lock of the interpreter held, any number of threads, the same result."""
+"""The compiled backend: runs without the GIL; any number of threads gives the same result."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ from shmmap_clients.ndt_scan_matcher.matching.settings import Limits
 
 __all__ = ["NumbaBackend"]
 
-_BATCH_ROWS: Final = 4096  # of many poses that are evaluated at once: 256 poses of 2048 points
+_BATCH_ROWS: Final = 4096  # rows in one batch of poses: 256 poses of 2048 points
 
 
 class NumbaBackend:
     """`Backend` over the compiled kernel.
 
-    The scan is cut into chunks of a fixed size, each with a row of sums of its own; threads take
-    runs of chunks, and rows are added in order: no result depends on the number of threads.
+    The scan is cut into chunks of a fixed size, each with its own row of sums.  Threads take runs of
+    chunks, and rows are added in order, so that results do not depend on the number of threads.
     """
 
     name = "numba"
@@ -49,7 +49,7 @@ class NumbaBackend:
         self._source = ScanBuffer(limits.source_points)
         self._max_poses = limits.poses
         self.max_map_bytes = limits.max_map_bytes
-        self.uploads = UploadStatistics()  # nothing is
+        self.uploads = UploadStatistics()  # stays zero: nothing is uploaded
         self._map = VoxelMap({})
         self._max_rows = max(-(-limits.source_points // CHUNK_POINTS), _BATCH_ROWS)
         self._rows = np.zeros((self._max_rows, SUMS))
@@ -68,7 +68,7 @@ class NumbaBackend:
             self._pool.shutdown()
 
     def prepare(self, voxel_map: VoxelMap, scoring: Scoring) -> None:
-        """Derive covariances and the table of addresses; nothing else is copied."""
+        """Compute covariances and the table of addresses; copy nothing else."""
         voxel_map.table(scoring.covariance)
 
     def set_map(self, voxel_map: VoxelMap) -> None:
@@ -76,11 +76,11 @@ class NumbaBackend:
         self._map = voxel_map
 
     def set_source(self, points: NDArray[np.floating]) -> int:
-        """Take a scan; returns how many points the limit left out."""
+        """Store a scan; return the number of points above the limit."""
         return self._source.take(points)
 
     def evaluate(self, poses: NDArray[np.float64], scoring: Scoring) -> list[Evaluation]:
-        """Return the evaluations of (k, 6) poses; threads share all their chunks."""
+        """Return the evaluations of (k, 6) poses; threads share the chunks of all poses."""
         check_batch(poses, self._max_poses)
         chunks = -(-len(self._source.points) // CHUNK_POINTS)
         each = max(self._max_rows // max(chunks, 1), 1)
@@ -91,7 +91,7 @@ class NumbaBackend:
         return found
 
     def step(self, at: Evaluation, steady: bool, /) -> NDArray[np.float64]:
-        """Return the step that an evaluation asks for."""
+        """Return the next step from an evaluation."""
         step = np.empty(6)
         step_into(np.ascontiguousarray(at.hessian), np.ascontiguousarray(at.gradient), steady, step)
         return step
@@ -103,7 +103,7 @@ class NumbaBackend:
         threads = min(len(self._scratch), max(units, 1))
         voxel_map = self._map
         gauss = gauss_for(voxel_map.leaf)
-        # one leaf: every neighbour in reach of the radius lies in the 27 cells around the point
+        # radius of one leaf: every neighbour within it lies in the 27 voxels around the point
         radius2 = voxel_map.leaf**2 if scoring.neighbors == "radius" else math.inf
         table = voxel_map.table(scoring.covariance)
         columns = self._columns[scoring.neighbors]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The backend for machines without a compiler: the same sums by whole-array operations.
+"""Backend for machines without numba: the same sums by whole-array operations.
 
-It holds the map's Gaussians once more, in private arrays of 80 bytes a voxel.
+It copies the map's Gaussians to private arrays of 80 bytes a voxel.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _BLOCK_POINTS: Final = 4096  # keeps intermediate arrays within the caches
 
 
 class _Gaussians:
-    """All Gaussians of a map under one lattice key each, in key order."""
+    """All Gaussians of a map, each with its lattice key, in key order."""
 
     def __init__(self, voxel_map: VoxelMap) -> None:
         self.map = voxel_map
@@ -50,7 +50,7 @@ class _Gaussians:
         rows = [cell.lattice[tuple(place.T)] for cell, place in zip(cells, places, strict=True)]
         ijk = [place + cell.lattice_origin for cell, place in zip(cells, places, strict=True)]
         lattice = np.concatenate([np.empty((0, 3), np.int64), *ijk])
-        # one step of room around, so that every neighbour of a clipped index has a key
+        # a margin of one step, so that every neighbour of a clipped index has a key
         self.low = (lattice.min(axis=0) if len(lattice) else np.zeros(3, np.int64)) - 2
         self.shape = (lattice.max(axis=0) if len(lattice) else np.zeros(3, np.int64)) - self.low + 3
         keys = np.ravel_multi_index((lattice - self.low).T, tuple(self.shape))
@@ -72,7 +72,7 @@ class _Gaussians:
 
 
 def _unpacked(packed: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Symmetric matrices (V, 3, 3) from their xx, xy, xz, yy, yz, zz."""
+    """Return symmetric matrices (V, 3, 3) from their xx, xy, xz, yy, yz, zz."""
     return packed[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
 
 
@@ -88,11 +88,11 @@ class NumpyBackend:
         self._most = limits.neighbors
         self._max_poses = limits.poses
         self.max_map_bytes = limits.max_map_bytes
-        self.uploads = UploadStatistics()  # nothing is
+        self.uploads = UploadStatistics()  # stays zero: nothing is uploaded
         self._gaussians = self._prepared = _Gaussians(VoxelMap({}))
 
     def close(self) -> None:
-        """Nothing to give back."""
+        """Do nothing: there is nothing to release."""
 
     def prepare(self, voxel_map: VoxelMap, scoring: Scoring) -> None:
         """Gather the map's Gaussians."""
@@ -108,7 +108,7 @@ class NumpyBackend:
         self._gaussians = prepared if prepared.map is voxel_map else _Gaussians(voxel_map)
 
     def set_source(self, points: NDArray[np.floating]) -> int:
-        """Take a scan; returns how many points the limit left out."""
+        """Store a scan; return the number of points above the limit."""
         return self._source.take(points)
 
     def evaluate(self, poses: NDArray[np.float64], scoring: Scoring) -> list[Evaluation]:
@@ -125,7 +125,7 @@ class NumpyBackend:
         return evaluations_of(np.array(rows).reshape(len(poses), len(blocks), SUMS), derivatives)
 
     def step(self, at: Evaluation, steady: bool, /) -> NDArray[np.float64]:
-        """Return the step that an evaluation asks for."""
+        """Return the next step from an evaluation."""
         return numpy_step(at, steady)
 
     def _pairs(
@@ -134,7 +134,7 @@ class NumpyBackend:
         neighbors: Neighbors,
         inverse: NDArray[np.float64],
     ) -> tuple[NDArray[np.intp], NDArray[np.intp], int, int]:
-        """Return points and their neighbours, point by point; and what the limit cut off."""
+        """Return pairs of point and neighbour, ordered by point, and the counts that the limit cut off."""
         gaussians = self._gaussians
         leaf = gaussians.map.leaf
         lattice = np.floor(moved * (1.0 / leaf)) - gaussians.low
@@ -154,7 +154,7 @@ class NumpyBackend:
         number = (last - first).ravel()
         hits = np.flatnonzero(number)
         repeats = number[hits]
-        # the voxels first, first + 1, ... of each hit: more than one where cells share a lattice place
+        # voxels first, first + 1, ... of each hit: several where cells share a lattice place
         begin = np.cumsum(repeats) - repeats
         voxel = np.repeat(first.ravel()[hits] - begin, repeats) + np.arange(int(repeats.sum()))
         point = points[np.repeat(hits // len(steps), repeats)]

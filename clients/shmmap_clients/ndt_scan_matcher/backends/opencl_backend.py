@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The backend for any device with an OpenCL driver: GPUs, accelerators, and processors.
+"""Backend for any device with an OpenCL driver: GPUs, accelerators, and processors.
 
-The map's Gaussians lie on the device, or are read where they lie in shared memory; a batch of poses is one
-launch.  All buffers are made once, as large as the limits allow.
+The map's Gaussians are copied to the device, or read in place from shared memory.  A batch of poses is one
+launch.  All buffers are allocated once, as large as the limits allow.
 """
 
 from __future__ import annotations
@@ -49,11 +49,11 @@ __all__ = ["OpenclBackend", "build_kernel", "kernel_source"]
 
 _POSE: Final = 40  # numbers of a pose in the kernel
 _LAUNCH_ROWS: Final = 4096  # chunks in a launch of many poses: 256 poses of 2048 points
-_TABLES_BYTES: Final = 18 << 20  # of one map, at most: its directory and the table of its cells
+_TABLES_BYTES: Final = 18 << 20  # upper bound for one map: its directory and the table of its cells
 _SEARCH: Final = {"direct1": 1, "direct7": 7, "radius": 27}
 
 _BUSY: Final[set[OpenclBackend]] = set()
-"""Backends whose devices did not answer in time: what a device may still read has to stay."""
+"""Backends whose devices did not answer in time: the device may still read their memory."""
 
 
 class OpenclBackend:
@@ -62,16 +62,16 @@ class OpenclBackend:
     Parameters
     ----------
     limits
-        What its buffers are made for.
+        Limits that set the size of the buffers.
     threads
         Not used: a device has its own.
     options
-        Which device, and how.
+        Choice of the device, its precision and its memory.
 
     Raises
     ------
     DeviceError
-        There is no such device, or it cannot do what the limits and options ask for.
+        There is no such device, or it does not meet the limits and options.
     """
 
     name = "opencl"
@@ -118,16 +118,16 @@ class OpenclBackend:
         if device.in_place:
             self.maps = MapInPlace(self._context)
         else:
-            # room for a map's second kind of covariance, too
+            # with space for a second kind of covariance
             self.maps = MapBuffers(self._context, device, 2 * (_TABLES_BYTES + self.max_map_bytes))
 
     @property
     def uploads(self) -> UploadStatistics:
-        """What was written to the device for maps."""
+        """Counts of writes of maps to the device."""
         return self.maps.statistics
 
     def _room_for_maps(self) -> int:
-        """Return the most bytes that a map may have: as limited, or what two buffers have room for."""
+        """Return the largest size of a map, bytes: the limit, or what fits into two buffers."""
         wanted = self._limits.max_map_bytes
         if self.device.in_place:
             return wanted
@@ -141,7 +141,7 @@ class OpenclBackend:
         return min(wanted, room)
 
     def close(self) -> None:
-        """Give back the device's memory; what a hung device still uses stays until the process ends."""
+        """Release the device's memory; keep memory that a hung device still uses until the process ends."""
         if self._closed or (self._running is not None and self._running.command_execution_status > 0):
             return
         self._closed = True
@@ -158,17 +158,17 @@ class OpenclBackend:
             buffer.release()
 
     def set_map(self, voxel_map: VoxelMap) -> None:
-        """Match against this map from now on; the work was done in `prepare`, or is done when it is used."""
+        """Match against this map from now on; `prepare` did the work, or the next evaluation does it."""
         self._map = voxel_map
         self._arguments.clear()
 
     def prepare(self, voxel_map: VoxelMap, scoring: Scoring) -> None:
-        """Write the map to the device beside the one in use, and build the program; from any thread."""
+        """Write the map to the device, next to the map in use, and build the program; from any thread."""
         self._kernel(scoring.neighbors)
         self.maps.prepare(voxel_map, scoring.covariance)
 
     def set_source(self, points: NDArray[np.floating]) -> int:
-        """Take a scan; returns how many points the limit left out."""
+        """Store a scan; return the number of points above the limit."""
         self._check_idle()
         dropped = self._source.take(points)
         self._source_is_new = True
@@ -184,7 +184,7 @@ class OpenclBackend:
         return found
 
     def step(self, at: Evaluation, steady: bool, /) -> NDArray[np.float64]:
-        """Return the step that an evaluation asks for; computed here, it is small."""
+        """Return the next step from an evaluation; this small computation runs on the host."""
         return numpy_step(at, steady)
 
     def _evaluated(self, poses: NDArray[np.float64], scoring: Scoring) -> list[Evaluation]:
@@ -199,7 +199,7 @@ class OpenclBackend:
         records, places = self._poses[:number], self._places[:number]
         translation = matrices[:, :3, 3]
         if not self.device.double:
-            # floats hold coordinates relative to the lattice place that the vehicle is in
+            # floats hold coordinates relative to the vehicle's lattice place
             with np.errstate(invalid="ignore"):
                 places[:] = np.floor(translation * (1.0 / self._map.leaf)).clip(-(2**30), 2**30)
             translation = translation - places * self._map.leaf
@@ -211,7 +211,7 @@ class OpenclBackend:
         rows = self._rows[: number * chunks]
         items = (chunks, number) if device.is_processor else (chunks * CHUNK_POINTS, number)
         with device_errors(device.info.name, "evaluate"):
-            # to release a copy's event is to wait for it: they are kept until all is done
+            # releasing a copy's event waits for it: keep the events until all copies are done
             inputs = [cl.enqueue_copy(queue, self._poses_buffer, records, is_blocking=False)]
             if self._source_is_new:
                 points_here = self._source.points
@@ -234,7 +234,7 @@ class OpenclBackend:
         return evaluations_of(rows.reshape(number, chunks, SUMS), derivatives)
 
     def _check_idle(self) -> None:
-        """Refuse to touch buffers that a device which did not answer in time still uses."""
+        """Raise if a device that did not answer in time still uses the buffers."""
         if self._running is None:
             return
         if self._running.command_execution_status > 0:
@@ -251,7 +251,7 @@ class OpenclBackend:
         return self._kernels[neighbors]
 
     def _ready_kernel(self, scoring: Scoring) -> Any:
-        """Return the kernel with all its arguments: they are set once for a map and a scan."""
+        """Return the kernel with all its arguments, which are set once for a map and a scan."""
         neighbors = scoring.neighbors
         kernel = self._kernel(neighbors)
         placed = self.maps.use(self._map, scoring.covariance)
@@ -272,7 +272,7 @@ class OpenclBackend:
             *(integer(side) for side in (*box, *placed.lead, placed.squares)),
             real(leaf),
             real(1.0 / leaf),
-            # one leaf: every neighbour in reach of the radius lies in the 27 cells around the point
+            # radius of one leaf: every neighbour within it lies in the 27 voxels around the point
             real(leaf**2 if neighbors == "radius" else math.inf),
             real(gauss.d1),
             real(gauss.d2),
@@ -289,24 +289,24 @@ def kernel_source() -> str:
 def build_kernel(
     context: Any, device: Device, neighbors: Neighbors, most: int, *, extra: Sequence[str] = ()
 ) -> Any:
-    """Return the kernel for a device, a new one; drivers keep what they have built, and build once.
+    """Return a new kernel for a device; drivers cache built programs.
 
     Parameters
     ----------
     context
-        Of the device.
+        Context of the device.
     device
     neighbors
         Which voxels a point is scored against.
     most
-        And how many of them at most.
+        Largest number of these voxels.
     extra
         More options for the driver's compiler.
 
     Raises
     ------
     KernelBuildFailed
-        With the beginning of what the driver says.
+        The driver refuses the program; the message has the beginning of its output.
     """
     import pyopencl as cl
 

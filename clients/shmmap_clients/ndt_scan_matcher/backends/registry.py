@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Backends by name, and the one that goes on without its device.
+"""Backends by name, and the backend that continues after its device has failed.
 
-What a backend needs is imported when it is chosen.
+The libraries of a backend are imported when the backend is chosen.
 """
 
 from __future__ import annotations
@@ -59,19 +59,19 @@ BACKENDS: Final[dict[str, Callable[[Limits, int, DeviceOptions], Backend]]] = {
 
 
 class FallbackBackend:
-    """A backend on a device, and another one that computes for good from the device's first fault on.
+    """A backend on a device, with a second backend that takes over at the device's first fault.
 
     Parameters
     ----------
     first
-        On a device.
+        Backend on a device.
     second
-        Its buffers are allocated from the beginning, so that going on costs nothing but the work itself.
+        Backend that takes over; its buffers are allocated in advance.
 
     Attributes
     ----------
     fault
-        Why the second one computes, or None.
+        Why the second backend computes; None while the first one does.
     """
 
     def __init__(self, first: Backend, second: Backend) -> None:
@@ -99,7 +99,7 @@ class FallbackBackend:
         return self._first.uploads
 
     def close(self) -> None:
-        """Give back threads and memory."""
+        """Release threads and memory."""
         self._first.close()
         self._second.close()
 
@@ -118,7 +118,7 @@ class FallbackBackend:
         self._trying(lambda backend: backend.set_map(voxel_map))
 
     def set_source(self, points: NDArray[np.floating]) -> int:
-        """Take a scan; returns how many points the limit left out."""
+        """Store a scan; return the number of points above the limit."""
         self._points = points
         return self._trying(lambda backend: backend.set_source(points))
 
@@ -127,7 +127,7 @@ class FallbackBackend:
         return self._trying(lambda backend: backend.evaluate(poses, scoring))
 
     def step(self, at: Evaluation, steady: bool, /) -> NDArray[np.float64]:
-        """Return the step that an evaluation asks for."""
+        """Return the next step from an evaluation."""
         return self._active.step(at, steady)
 
     def _trying(self, work: Callable[[Backend], _T]) -> _T:
@@ -137,7 +137,7 @@ class FallbackBackend:
             except DeviceError as error:
                 self._give_up(error)
         if self._active is self._first:
-            # the first call since the fault: the second backend gets what the first one had
+            # first call after the fault: pass the first backend's map and scan to the second
             if self._map is not None:
                 self._second.set_map(self._map)
             if self._points is not None:
@@ -166,20 +166,20 @@ def backend_named(
     name
         A key of `BACKENDS`; another program may add its own.
     limits
-        What its buffers are made for.
+        Limits that set the size of its buffers.
     threads
-        How many it may use; results do not depend on it.
+        Number of threads it may use; results do not depend on it.
     options
-        For one that computes on a device.
+        Options of a backend that computes on a device.
     fallback
-        Name of the backend that goes on where a device fails later.
+        Name of the backend that takes over if a device fails later.
 
     Raises
     ------
     BadRequest
         There is no such backend.
     DeviceError
-        There is no such device, or it cannot do what is asked: also with a fallback.
+        There is no such device, or it lacks a required feature; also raised if there is a fallback.
     """
     for one in (name, fallback):
         if one is not None and one not in BACKENDS:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The program ``shmmap-ndt``: ``align`` files, ``follow`` a drive, and what concerns the machine."""
+"""The program ``shmmap-ndt``: ``align`` files, ``follow`` a drive, and verbs about the machine."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap-ndt align``: one scan, one map, one guess, no daemon; and the options of every alignment."""
+"""``shmmap-ndt align``: one scan, one map, one guess, no daemon; also the options of all alignments."""
 
 from __future__ import annotations
 
@@ -246,7 +246,7 @@ def _add_limit_options(parser: argparse.ArgumentParser) -> None:
 
 
 def matcher_from(args: argparse.Namespace) -> NdtMatcher:
-    """Return the matcher that the options ask for."""
+    """Return a matcher with the given options."""
     from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher
     from shmmap_clients.ndt_scan_matcher.matching.settings import Limits, Settings
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap-ndt device-check``: whether a device computes what numpy computes, each time, and how fast.
+"""``shmmap-ndt device-check``: compare a device's results with numpy's, repeatedly, and measure its speed.
 
-Scenes are generated, and their Gaussians computed, by numpy alone, so that it also runs where numba has no
-wheel.  Bounds are what separates programs in double precision, and what floats can hold: see `BOUNDS`.
+Only numpy generates the scenes and their Gaussians, so that the check also runs where numba has no wheel.
+The bounds allow for rounding, in double precision and in floats; see `BOUNDS`.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _BATCH: Final = 12
 _TIMED: Final = 200  # evaluations, and poses of a batch
 _TIMED_BATCHES: Final = 20
 
-_FAR: Final = (89_560.0, 42_300.0)  # Autoware's sample map lies there
+_FAR: Final = (89_560.0, 42_300.0)  # position of Autoware's sample map
 SCENES: Final = (  # origin, metres; leaf, metres; points of the scan
     ((0.0, 0.0), 2.0, 1500),
     ((0.0, 0.0), 1.0, 16_000),
@@ -53,20 +53,20 @@ SCENES: Final = (  # origin, metres; leaf, metres; points of the scan
 _TRUTH: Final = np.array([1.3, 0.4, 1.8, 0.02, -0.03, 0.4])
 _OFF: Final = np.array([0.4, -0.3, 0.2, 0.01, 0.02, -0.04])
 _CELL_M: Final = 20.0
-_LEAST_POINTS: Final = 6  # of a voxel
+_LEAST_POINTS: Final = 6  # least points of a voxel
 _RADIUS: Final = Scoring("radius", "autoware")
 
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """How far two results may be apart.
+    """Largest allowed differences between two results.
 
     Attributes
     ----------
     evaluation
         Score, gradient and Hessian of one pose, relative to the largest element.
     t_m, R, transform_probability
-        Of an alignment: metres, elements of the rotation, score per point.
+        Differences of an alignment: metres, elements of the rotation, score per point.
     """
 
     evaluation: float
@@ -75,7 +75,7 @@ class Bounds:
     transform_probability: float
 
 
-# floats: 2^-24 of 100 m is 6 micrometres for a point, and some thousand points share the error of a pose
+# floats: 2^-24 of 100 m is 6 micrometres for a point, and thousands of points average the error of a pose
 BOUNDS: Final = {
     "double": Bounds(1e-12, 1e-9, 1e-9, 1e-9),
     "float": Bounds(2e-4, 1e-4, 2e-5, 2e-3),
@@ -84,7 +84,7 @@ BOUNDS: Final = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Scene:
-    """A map, a scan in its own frame, (N, 3), metres, and what numpy aligns it to from one pose vector."""
+    """A map, a scan in its own frame, (N, 3), metres, and numpy's results from one pose vector."""
 
     name: str
     voxel_map: VoxelMap
@@ -108,7 +108,7 @@ class _Check:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Compare, print, write the report; returns the exit code."""
+    """Compare, print, write the report; return the exit code."""
     chosen = [
         info
         for info in list_devices()
@@ -138,7 +138,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _checked(info: DeviceInfo, scenes: list[_Scene]) -> Iterator[dict[str, Any]]:
-    """Check a device in every precision that it has, and each memory that it can read maps from."""
+    """Check a device in each precision and each kind of map memory that it supports."""
     print_line(info.describe())
     options = [DeviceOptions(str(info.index), "float", "copy")]
     if info.fp64:
@@ -228,7 +228,7 @@ def _ready(scene: _Scene, backend: str, limits: Limits, device: DeviceOptions) -
 
 
 def _check_evaluations(scene: _Scene, device: DeviceOptions, most: int) -> _Check:
-    """Compare score, gradient, Hessian and counts by each search and covariance."""
+    """Compare score, gradient, Hessian and counts for each search and covariance."""
     limits = replace(scene.limits, neighbors=most)
     here, there = (_ready(scene, backend, limits, device) for backend in ("numpy", "opencl"))
     worst, failures = 0.0, []
@@ -244,7 +244,7 @@ def _check_evaluations(scene: _Scene, device: DeviceOptions, most: int) -> _Chec
             worst = max(worst, off)
             if not off <= BOUNDS[device.precision].evaluation:
                 failures.append(f"{neighbors}, {covariance}: {off:.3g} off")
-            # where coordinates are floats, a point on a voxel's border may be in the next one
+            # where coordinates are floats, a point on a voxel's border may fall into the next one
             if device.precision == "double" and _counts(found) != _counts(wanted):
                 failures.append(f"{neighbors}, {covariance}: counts {_counts(found)}, not {_counts(wanted)}")
     here.close()
@@ -254,7 +254,7 @@ def _check_evaluations(scene: _Scene, device: DeviceOptions, most: int) -> _Chec
 
 
 def _check_repeats(scene: _Scene, device: DeviceOptions) -> _Check:
-    """Compare repeats, and a batch of poses with single poses, bit for bit."""
+    """Compare repeated runs, and a batch of poses with single poses, bit for bit."""
     there = _ready(scene, "opencl", scene.limits, device)
     first, *repeats = [there.evaluate(scene.guess[None], _RADIUS)[0] for _ in range(_REPEATS + 1)]
     unlike = sum(not _same(again, first) for again in repeats)
@@ -287,7 +287,7 @@ def _same(a: Evaluation, b: Evaluation) -> bool:
 
 
 def _latencies(scene: _Scene, device: DeviceOptions) -> dict[str, Any]:
-    """Return how long a device takes, milliseconds, as the help describes it."""
+    """Return the latencies of a device, milliseconds, as the help describes them."""
     pose = scene.guess[None]
     backend = backend_named("opencl", scene.limits, options=device)
     backend.set_source(scene.scan)
@@ -322,7 +322,7 @@ def _spread(work: Callable[[], object], repeats: int) -> dict[str, float]:
 
 
 def _scene(origin: tuple[float, float], leaf: float, points: int) -> _Scene:
-    """Return a scan of a street and what the numpy backend aligns it to, in each variant and search."""
+    """Return a scan of a street with the numpy backend's alignment in each variant and search."""
     moved = np.array([*origin, 0.0])
     target = _street(np.random.default_rng(1)) + moved
     # another sampling of the same street: a scan never holds the map's own points
@@ -351,7 +351,7 @@ def _street(rng: np.random.Generator) -> NDArray[np.float64]:
     left = filled(12_000, (-30.0, 30.0), (9.0, 9.0), (0.0, 6.0))
     right = filled(12_000, (-30.0, 30.0), (-8.0, -8.0), (0.0, 5.0))
     parts = [ground, left, right]
-    # fronts that stand out: without them nothing holds a scan along the street
+    # protruding house fronts: without them nothing fixes a scan along the street
     for x in range(-28, 29, 7):
         parts.append(filled(900, (x, x), (6.5, 9.0), (0.0, 6.0)))
         parts.append(filled(900, (x + 2.5, x + 2.5), (-8.0, -5.5), (0.0, 5.0)))

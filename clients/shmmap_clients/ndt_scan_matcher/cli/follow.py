@@ -123,7 +123,7 @@ def run(args: argparse.Namespace) -> int:
     plot = DrivePlot()
     route = read_route(args.route) if args.route is not None else ()
     with contextlib.ExitStack() as stack:
-        # all sockets before the first scan: a publisher may wait for this program's subscription
+        # open all sockets before the first scan: a publisher may wait for this subscription
         publisher = stack.enter_context(PosePublisher(args.publish)) if args.publish else None
         subscriber = _odometry(args, stack)
         drive = ScanDrive(args, "shmmap-ndt", args.truth, stack, one_line=True, rate=args.rate)
@@ -178,7 +178,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _odometry(args: argparse.Namespace, stack: contextlib.ExitStack) -> OdometrySubscriber | None:
-    """Return the odometry of an endpoint; None where it is in a file, or there is none."""
+    """Return a subscriber to the odometry endpoint; None if odometry is in a file or absent."""
     from shmmap_clients.ndt_scan_matcher.drive.pose_stream import OdometrySubscriber
     from shmmap_clients.streams import is_endpoint
 
@@ -195,7 +195,7 @@ def _map_updater(
     matcher: NdtMatcher,
     route: NDArray[np.float64] | Sequence[tuple[float, float]],
 ) -> MapUpdater:
-    """Return what keeps the map around the vehicle."""
+    """Return the updater of the map around the vehicle."""
     from shmmap_clients.ndt_scan_matcher.map.map_updater import MapRules, MapUpdater
 
     rules = MapRules(
@@ -210,7 +210,7 @@ def _map_updater(
 
 
 def _start(args: argparse.Namespace, first: Scan) -> tuple[NDArray[np.float64], bool]:
-    """Return the pose where the drive begins, and whether it is known well."""
+    """Return the first pose of the drive, and whether it is accurately known."""
     from shmmap import BadRequest
 
     if args.init is not None:
@@ -228,7 +228,7 @@ def _prediction(
     subscriber: OdometrySubscriber | None,
     source: Iterable[Scan],
 ) -> MotionPrediction:
-    """Return what predicts the next pose; the first velocity is the truth's, or that of the route's times."""
+    """Return the motion prediction; its first velocity comes from the truth or the route's times."""
     from shmmap_clients.ndt_scan_matcher.drive import motion_prediction
     from shmmap_clients.ndt_scan_matcher.drive.motion_prediction import ConstantVelocity, Odometry
     from shmmap_clients.scans.scan_sequence import ScanSequence
@@ -249,9 +249,9 @@ def _prediction(
 
 
 def _relocalizer(args: argparse.Namespace, stack: contextlib.ExitStack) -> Relocalizer | None:
-    """Return what searches for a lost vehicle, if that is wanted.
+    """Return the search for a lost vehicle, or None if it is disabled.
 
-    It has a session of its own from the first search on.
+    The search opens its own session with the daemon at the first use.
     """
     from shmmap_clients.pose_initializer import InitializerRules, PoseInitializer, Relocalizer
     from shmmap_clients.streams import is_endpoint

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What ``shmmap-ndt follow`` says while it runs, and its summary in words."""
+"""Progress messages of ``shmmap-ndt follow``, and its summary as text."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ __all__ = ["FollowReport", "print_summary"]
 
 
 class FollowReport:
-    """Counts the frames of a drive, and reports on stderr what a reader has to know.
+    """Counter of the frames of a drive, with reports of notable events on stderr.
 
     Parameters
     ----------
     drive
-        Of the scans; prints the reports.
+        Drive over the scans; prints the reports.
     client, matcher, maps, relocalizer
-        What the drive works with.
+        Objects that the drive uses.
     hint
-        Hint for a lost vehicle where nothing searches for it; printed once.
+        Hint printed once when the vehicle is lost and no search is configured.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class FollowReport:
         self._last_stamp_s = 0.0
 
     def add(self, frame: Frame) -> None:
-        """Count the next frame, and say what is new with it."""
+        """Count the next frame, and report changes."""
         statistics, where = self.statistics, f"at scan {frame.name}"
         statistics.add(frame)
         if frame.result.no_map and statistics.no_map == 1:
@@ -70,7 +70,7 @@ class FollowReport:
             self._say(f"the device failed {where}, {self._matcher.backend_name} goes on: {why}")
 
     def _say_state(self, frame: Frame, where: str) -> None:
-        """Say when the vehicle gets lost or is found again, and once what finds it where nothing searches."""
+        """Report when the vehicle is lost or found again; without a search, print the hint once."""
         before, self._state = self._state, frame.state
         if frame.relocalized:
             x, y = frame.result.T_map_base[:2, 3]
@@ -98,7 +98,7 @@ class FollowReport:
 
 
 def print_summary(summary: DriveSummary, left_out: str = "") -> None:
-    """Print the summary of a drive for people; rows without data (scores without a map) are left out."""
+    """Print the summary of a drive as text, without rows that have no data (scores without a map)."""
     s = summary
     print(
         f"scans           {s.frames}: {s.converged} converged, {s.trustworthy} trusted,"
@@ -146,7 +146,7 @@ def print_summary(summary: DriveSummary, left_out: str = "") -> None:
         ("map building, ms", s.map_build_ms),
         ("  preparing, ms", s.map_prepare_ms),
     ):
-        if not spread.max > 0.0:  # none (NaN), or no scan had it
+        if not spread.max > 0.0:  # NaN, or no scan has this value
             continue
         print(
             f"{name:22} mean {spread.mean:8.3f}  variance {spread.variance:10.4f}  p50 {spread.p50:8.3f}"

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Verbs about this machine: ``warmup`` of kernels, ``devices`` for ``--backend opencl``, ``device-check``.
 
-The last is for reports of defects: the help of the program does not list it.
+``device-check`` is for bug reports; the program's help does not list it.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def add_parser(subparsers: Any) -> None:
 def warmup_alignment(settings: Settings | None = None) -> Result:
     """Align the walls of a room of 8 m with themselves from a guess 0.2 m away.
 
-    This touches all that a real alignment needs, in milliseconds.
+    This runs all code of a real alignment within milliseconds.
     """
     import numpy as np
 
@@ -109,7 +109,7 @@ def warmup_alignment(settings: Settings | None = None) -> Result:
 
 
 def _warm_up(args: argparse.Namespace) -> int:
-    """Compile, or load what was compiled, and print how long it took."""
+    """Compile the kernels, or load them from the cache, and print the time taken."""
     begin = time.monotonic()
     if args.backend == "opencl":
         from shmmap_clients.ndt_scan_matcher.matching.settings import Settings
@@ -129,7 +129,7 @@ def _warm_up(args: argparse.Namespace) -> int:
 
 
 def _list_devices(args: argparse.Namespace) -> int:
-    """List; exit code 1 where none can be used."""
+    """List the devices; exit code 1 if none can be used."""
     from shmmap_clients.ndt_scan_matcher.backends.opencl.devices import NO_DRIVER_HINT, list_devices
 
     found = list_devices()

@@ -22,7 +22,7 @@ _OURS, _TRUTH, _BAD, _SECOND = "#1f6fb4", "#999999", "#c0392b", "#e08e0b"
 
 
 class _Row(NamedTuple):
-    """What is drawn of one frame."""
+    """Plotted values of one frame."""
 
     ours: tuple[float, float]
     truth: tuple[float, float] | None
@@ -34,7 +34,7 @@ class _Row(NamedTuple):
 
 
 class DrivePlot:
-    """Collects what is drawn of a drive; of a long one every k-th frame, and so of those not trusted."""
+    """Collector of a drive's plotted frames; on long drives every k-th, also of the untrusted ones."""
 
     def __init__(self) -> None:
         self._frames = 0
@@ -42,14 +42,14 @@ class DrivePlot:
         self._untrusted: Decimated[tuple[float, float]] = Decimated()
 
     def add(self, frame: Frame) -> None:
-        """Take the next frame."""
+        """Add the next frame."""
         T, truth = frame.result.T_map_base, frame.T_truth
         error_m = error_deg = math.nan
         if truth is not None:
             metres, degrees = pose_errors(T[None], truth[None])
             error_m, error_deg = float(metres[0]), float(degrees[0])
         place = (float(T[0, 3]), float(T[1, 3]))
-        # the first scan waits for the map: it would flatten all others
+        # the first scan waits for the map: its latency would flatten all others
         times = (frame.latency_s * 1e3, frame.align_s * 1e3) if self._frames else (math.nan, math.nan)
         true_place = None if truth is None else (float(truth[0, 3]), float(truth[1, 3]))
         self._rows.add(_Row(place, true_place, error_m, error_deg, *times, frame.result.nvtl))
@@ -94,7 +94,7 @@ class DrivePlot:
 
 
 def _chart(page: Page, top: float, title: str, lines: Mapping[str, Sequence[float]]) -> None:
-    """Draw values over the number of the scan, one line for each colour."""
+    """Draw values over the scan number, one line for each colour."""
     every = [value for values in lines.values() for value in values if math.isfinite(value)]
     most = max(every, default=0.0) or 1.0
     last = max(1, *(len(values) - 1 for values in lines.values()))

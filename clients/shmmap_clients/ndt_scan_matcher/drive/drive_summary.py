@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One scan's result as JSON, and a whole drive in numbers: errors, scores, latencies, costs of the map."""
+"""One scan's result as JSON, and statistics of a drive: errors, scores, latencies, costs of the map."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ __all__ = [
 ]
 
 _STRETCHES_M: Final = (10.0, 50.0, 100.0)
-_START_EVERY_M: Final = 0.05  # a vehicle that stands begins no stretches
+_START_EVERY_M: Final = 0.05  # a standing vehicle starts no stretches
 Matrix = NDArray[np.float64]
 
 
@@ -40,11 +40,11 @@ class TrajectoryErrors:
     Attributes
     ----------
     ate_m, ate_deg
-        Absolute error of each pose; the map is the frame, nothing is fitted.
+        Absolute error of each pose in the map frame, without fitting.
     ate_rmse_m
         Root of the mean square.
     rte
-        By length of stretch in metres: mean error of the motion over it, metres per 100 m.
+        Mean relative error over stretches, metres per 100 m, by the stretch's length in metres.
     """
 
     ate_m: Spread
@@ -56,25 +56,25 @@ class TrajectoryErrors:
 def pose_errors(
     poses: NDArray[np.float64], truth: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return metres and degrees between (N, 4, 4) poses and the truth."""
+    """Return distance, metres, and angle, degrees, between (N, 4, 4) poses and the truth."""
     off = np.linalg.inv(truth) @ poses
     cosine = np.clip((np.trace(off[:, :3, :3], axis1=1, axis2=2) - 1.0) / 2.0, -1.0, 1.0)
     return np.linalg.norm(off[:, :3, 3], axis=1), np.degrees(np.arccos(cosine))
 
 
 class RunningErrors:
-    """Compares each pose with the true one, in memory that does not grow with their number."""
+    """Running comparison of poses with the truth, in constant memory."""
 
     def __init__(self) -> None:
         self._ate_m, self._ate_deg = RunningSpread(), RunningSpread()
         self._way = 0.0
         self._last: Matrix | None = None
-        # by length of stretch: where stretches have begun whose end has not come, with both poses
+        # by length of stretch: starts of stretches that have not ended, with both poses
         self._starts: dict[float, deque[tuple[float, Matrix, Matrix]]] = {m: deque() for m in _STRETCHES_M}
         self._rte = {metres: RunningSpread() for metres in _STRETCHES_M}
 
     def add(self, pose: Matrix, truth: Matrix) -> None:
-        """Take the next pose, (4, 4), and the true one."""
+        """Add the next pose, (4, 4), and the true one."""
         metres, degrees = pose_errors(pose[None], truth[None])
         self._ate_m.add(float(metres[0]))
         self._ate_deg.add(float(degrees[0]))
@@ -102,49 +102,49 @@ class RunningErrors:
 
 @dataclass(frozen=True, slots=True)
 class DriveSummary:
-    """A drive in numbers.
+    """Statistics of a drive.
 
     Attributes
     ----------
     frames, converged, trustworthy
-        Scans, and how many of their alignments were that.
+        Number of scans, and of converged and trustworthy alignments.
     no_map
         Scans that had no map around them.
     lost, relocalized, clock_jumps
-        Scans after which the vehicle was lost, searches that found it again, and scans before which the
-        clock had jumped.
+        Number of times the vehicle was lost, of searches that found it again, and of scans before which
+        the clock had jumped.
     failed_limits
-        How many results failed each limit of trust, by its name.
+        Number of results that failed each limit of trust, by the limit's name.
     trust
-        Those limits.
+        Limits of trust.
     waited
         Scans that had to wait for the map; the first always does.
     too_slow
-        How often the map did not reach far enough any more.
+        Number of times the map no longer reached far enough.
     cut_frames
-        Scans of which a limit left something out.
+        Number of scans for which a limit left something out.
     cut_by
-        How many scans each limit left something out of: ``points``, ``neighbors``, ``voxels``, ``map_bytes``,
+        Number of these scans by limit: ``points``, ``neighbors``, ``voxels``, ``map_bytes``,
         ``deadline``.
     backend
-        Which one computed last.
+        Name of the backend that computed last.
     fault
-        Why that is the fallback; None where it is not.
+        Reason for using the fallback; None if it was not used.
     errors
-        None where no truth was given.
+        Errors of the trajectory; None without truth.
     transform_probability, nvtl, iterations
         Spreads over the scans.
     latency_ms, align_ms, thin_ms, map_ms
-        From having the scan to having the pose, and the parts of it; the first scan, which waits for
-        the map and the compiler's cache, is left out.
+        Time from receiving the scan to the pose, and its parts, without the first scan, which waits for
+        the map and the compiler's cache.
     map_updates, cells_added, cells_removed
         Changes of the map in use.
     map_request_ms, map_build_ms, map_prepare_ms
-        What they cost, in another thread; the last is a part of the one before, see `UpdateStatistics`.
+        Time of these changes in another thread; ``build`` includes ``prepare``, see `UpdateStatistics`.
     map_private_bytes
-        This process's own memory for a map, at most.
+        Largest private memory of this process for a map.
     map_written_bytes, map_writes, map_laid_out_again
-        What was written to a device, see `UploadStatistics`.
+        Counts of writes to a device, see `UploadStatistics`.
     """
 
     frames: int
@@ -182,14 +182,14 @@ class DriveSummary:
     map_laid_out_again: int
 
     def as_document(self) -> dict[str, Any]:
-        """Return the summary for JSON: numbers that are not there are null."""
+        """Return the summary for JSON, with null for missing numbers."""
         document = _without_nan(dataclasses.asdict(self))
         assert isinstance(document, dict)  # noqa: S101  # a dataclass is one
         return document
 
 
 class DriveStatistics:
-    """Sums up frame after frame; its size does not depend on how many."""
+    """Running statistics of frames, in constant memory."""
 
     def __init__(self) -> None:
         self.frames = self.trustworthy = self.no_map = self.clock_jumps = 0
@@ -201,7 +201,7 @@ class DriveStatistics:
         self._times = {name: RunningSpread() for name in ("latency_s", "align_s", "thin_s", "map_s")}
 
     def add(self, frame: Frame) -> None:
-        """Take the next frame."""
+        """Add the next frame."""
         result = frame.result
         self.frames += 1
         self._converged += result.converged
@@ -231,7 +231,7 @@ class DriveStatistics:
         backend: str = "numba",
         fault: DeviceError | None = None,
     ) -> DriveSummary:
-        """Return the drive so far; with its map's updates, limits of trust, and the backend."""
+        """Return the summary of the drive so far, with map updates, limits of trust, and the backend."""
         return DriveSummary(
             frames=self.frames,
             converged=self._converged,
@@ -276,17 +276,17 @@ def _without_nan(value: Any) -> Any:
 
 
 def frame_document(frame: Frame) -> dict[str, Any]:
-    """Return what ``shmmap-ndt follow --json-lines`` writes about one scan.
+    """Return the JSON object that ``shmmap-ndt follow --json-lines`` writes for one scan.
 
     Returns
     -------
     dict
         ``name``; ``stamp_s``; ``pose``: x, y, z (metres, map frame) and the quaternion qx, qy, qz, qw;
-        ``converged``, ``trustworthy``, and ``failed_limits``: why not, see `TrustLimits.failed`;
+        ``converged``, ``trustworthy``, and ``failed_limits``, see `TrustLimits.failed`;
         ``no_map``; ``state``: ``tracking``, ``uncertain`` or ``lost``; ``relocalized``; ``clock_jumped``;
-        ``iterations``, ``transform_probability``, ``nvtl``; ``waited``: for the map;
-        ``latency_ms``: from having the scan to having the pose; ``error_m`` and ``error_deg``: distance
-        and angle to the true pose, null where the scan has none.
+        ``iterations``, ``transform_probability``, ``nvtl``; ``waited`` (for the map);
+        ``latency_ms``: from receiving the scan to the pose; ``error_m`` and ``error_deg``: distance
+        and angle to the true pose, null for a scan without one.
     """
     result = frame.result
     T = result.T_map_base

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Localization of a drive, scan by scan: predict, take the newest map, align, judge; search when lost.
 
-A vehicle is followed or lost::
+The vehicle is tracked, uncertain or lost::
 
     uncertain --trusted--> tracking --not trusted--> uncertain --not trusted, repeatedly--> lost
     tracking, uncertain --no map--> lost
     lost --trusted, or relocalized--> tracking
 
-A drive begins ``uncertain``, or ``lost`` where its first pose is only roughly known.
+A drive begins ``uncertain``, or ``lost`` if its first pose is only roughly known.
 """
 
 from __future__ import annotations
@@ -32,23 +32,23 @@ from shmmap_clients.scans.scan_sequence import Scan
 __all__ = ["LOST_AFTER", "Follower", "Frame", "Relocalize", "State", "Tracking"]
 
 State = Literal["tracking", "uncertain", "lost"]
-LOST_AFTER: Final = 5  # as many rejected poses make Autoware's ndt_scan_matcher report an error
+LOST_AFTER: Final = 5  # Autoware's ndt_scan_matcher reports an error after as many rejected poses
 _BLIND_SEARCHES: Final = 4
-"""With one scan, each twice as far: a vehicle that was not lost cannot be farther."""
-_SHORT_S: Final = 0.2  # in which a vehicle goes no farther than an alignment finds back
+"""Searches with a single scan, each twice as far: a vehicle that was not lost cannot be farther."""
+_SHORT_S: Final = 0.2  # time in which a vehicle stays within the reach of an alignment
 _SAME_M: Final = 0.5
 Relocalize = Callable[[NDArray[np.floating], NDArray[np.float64]], Result | None]
 
 
 class Tracking:
-    """Judges after each result whether the vehicle is tracked, uncertain or lost.
+    """State machine: after each result, the vehicle is tracked, uncertain or lost.
 
     Parameters
     ----------
     lost_after
-        Number of untrusted results in a row that make it lost; a single one without a map does so, too.
+        Number of consecutive untrusted results after which the vehicle is lost; one without a map suffices.
     lost
-        Whether it is lost at the beginning.
+        Whether the vehicle is lost at the beginning.
     """
 
     def __init__(self, lost_after: int = LOST_AFTER, *, lost: bool = False) -> None:
@@ -78,21 +78,21 @@ class Frame:
     Attributes
     ----------
     name, stamp_s
-        The scan's.
+        Name and time of the scan.
     result
-        Of the alignment.
+        Result of the alignment.
     T_guess : (4, 4)
-        Where it began.
+        Pose where the alignment began.
     T_truth : (4, 4) or None
-        Where the scan was really taken, if it says so.
+        True pose of the scan, if the scan has one.
     state
-        Whether the vehicle is followed or lost, see `Tracking`.
+        Whether the vehicle is tracked, uncertain or lost, see `Tracking`.
     relocalized
-        Whether the result is one of a search for the lost vehicle.
+        Whether the result is from a search for the lost vehicle.
     clock_jumped
-        Whether the time since the scan before makes no sense: no motion was predicted.
+        Whether the time since the last scan was implausible, so that no motion was predicted.
     thin_s, map_s, align_s, relocalize_s
-        Seconds for thinning the scan, for taking the map, for the alignment, for the search.
+        Seconds for thinning the scan, getting the map, the alignment, and the search.
     waited
         Whether the scan had to wait for the map.
     """
@@ -113,7 +113,7 @@ class Frame:
 
     @property
     def latency_s(self) -> float:
-        """Time from having the scan to having the pose."""
+        """Time from receiving the scan to the pose, seconds."""
         return self.thin_s + self.map_s + self.align_s + self.relocalize_s
 
 
@@ -123,16 +123,15 @@ class Follower:
     Parameters
     ----------
     matcher, maps, prediction
-        What aligns, what keeps the map, what guesses.
+        Scan matcher, updater of the map, and prediction of the next pose.
     thin
-        Scans are thinned to one point per cube of this many metres; None: not at all.
+        Edge of the cubes that keep one point each, metres; None: no thinning.
     tracking
-        Says when the vehicle is lost.
+        Decides when the vehicle is lost.
     relocalize
-        Called with each scan of a lost vehicle, (N, 3), metres, and the last pose that was known, (4, 4):
-        returns a result that is trusted, or None.  Where little says how the vehicle has moved (at the
-        beginning, after a jump of the clock), already with the first scan whose result is not trusted, and
-        with a trusted one where much may have happened.
+        Called with each scan of a lost vehicle, (N, 3), metres, and the last known pose, (4, 4); returns
+        a trusted result, or None.  Where the motion is unknown (at the beginning, after a jump of the
+        clock), it is called at the first untrusted result; after a long gap, even at a trusted one.
     """
 
     def __init__(
@@ -160,7 +159,7 @@ class Follower:
         Raises
         ------
         ShmmapError
-            The daemon cannot give the map.
+            The daemon cannot provide the map.
         """
         begin = time.perf_counter()
         points = thinned(scan.xyz, self._thin)
@@ -185,11 +184,11 @@ class Follower:
             searches = 1
         elif blind and not result.trustworthy:
             searches = _BLIND_SEARCHES
-        else:  # from metres off an alignment may end in a wrong place that looks right
+        else:  # an alignment that starts metres off may end at a wrong pose that looks right
             unknown = step_s is None or (step_s > _SHORT_S and not self._prediction.knows_velocity)
             searches = int(blind and unknown)
         for _ in range(searches if self._relocalize is not None else 0):
-            assert self._relocalize is not None  # noqa: S101  # no search otherwise
+            assert self._relocalize is not None  # noqa: S101  # else there is no search
             found = self._relocalize(points, self._prediction.T_known)
             if found is not None and _is_better(found, result):
                 result, relocalized, self._jumped = found, True, True
@@ -217,7 +216,7 @@ class Follower:
 
 
 def _is_better(found: Result, result: Result) -> bool:
-    """Whether a search has found another place than an alignment, where the scan fits better."""
+    """Return whether a search found a different pose than the alignment, where the scan fits better."""
     if not result.trustworthy:
         return True
     apart = float(np.linalg.norm(found.T_map_base[:3, 3] - result.T_map_base[:3, 3]))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the next scan was probably taken: from odometry, or at constant velocity."""
+"""Prediction of the next scan's pose: from odometry, or at constant velocity."""
 
 from __future__ import annotations
 
@@ -24,30 +24,30 @@ __all__ = [
 ]
 
 LONGEST_STEP_S: Final = 1.0 + 1e-3
-"""Between two scans; more is a pause or a clock that was set.  A scanner of 1 Hz is not exact."""
-_STEADY_S: Final = 0.5  # as Autoware's five lost scans at 10 Hz; braking hard, 0.6 m
+"""Longest time between two scans of a 1 Hz scanner, with tolerance; more is a pause or a clock jump."""
+_STEADY_S: Final = 0.5  # Autoware's five lost scans at 10 Hz; hard braking changes the path by 0.6 m
 _ON_ROUTE_M: Final = 10.0
 
 Matrix = NDArray[np.float64]
 
 
 class ConstantVelocity:
-    """The next motion is the last one, scaled by the time it has, at most `LONGEST_STEP_S` of it.
+    """Predict that the last motion continues, scaled to the next time step, at most `LONGEST_STEP_S`.
 
-    A clock that jumps says nothing of motion: a step of no time, back, or of more than that predicts none,
-    and the velocity is unknown until two poses in a row are known again.
+    A clock jump gives no motion: after a step that is zero, negative or longer than that, the pose is
+    unchanged, and the velocity is unknown until two consecutive poses are known again.
 
     Parameters
     ----------
     T_map_base : (4, 4)
         The first pose.
     twist : (6,), optional
-        The velocity there, where it is known: metres and radians per second, base frame.
+        Velocity at the first pose, if known: metres and radians per second, base frame.
 
     Attributes
     ----------
     T_known : (4, 4)
-        The last pose that was known: where a search for a lost vehicle begins.
+        The last known pose, where a search for a lost vehicle begins.
     """
 
     def __init__(self, T_map_base: Matrix, twist: NDArray[np.float64] | None = None) -> None:
@@ -55,11 +55,11 @@ class ConstantVelocity:
         self._twist = twist
         self._stamp_s: float | None = None  # of the last scan
         self._since_s: float | None = (
-            0.0  # from the known pose to that scan; None: the clock jumped meanwhile
+            0.0  # from the last known pose to the last scan; None: the clock jumped meanwhile
         )
 
     def predict(self, stamp_s: float) -> Matrix:
-        """Return the probable (4, 4) pose at a time, seconds."""
+        """Return the predicted (4, 4) pose at a time, seconds."""
         elapsed_s = self._elapsed(stamp_s)
         if elapsed_s is None or self._twist is None:
             return self.T_known
@@ -74,18 +74,18 @@ class ConstantVelocity:
 
     @property
     def knows_velocity(self) -> bool:
-        """Whether there is a velocity to go by."""
+        """Whether the velocity is known."""
         return self._twist is not None
 
     def is_blind(self, stamp_s: float) -> bool:
-        """Whether little says how it has moved since the last known pose: no velocity, or an old one."""
+        """Whether the motion since the last known pose is uncertain: no velocity, or an old one."""
         if self._stamp_s is None:
             return False
         elapsed_s = self._elapsed(stamp_s)
         return self._twist is None or elapsed_s is None or elapsed_s >= _STEADY_S
 
     def correct(self, stamp_s: float, T_map_base: Matrix | None) -> None:
-        """Learn where a scan was taken; None: that is not known."""
+        """Record the pose of a scan; None if it is unknown."""
         elapsed_s = self._elapsed(stamp_s)
         if elapsed_s is None or elapsed_s > LONGEST_STEP_S:
             self._twist = None
@@ -98,52 +98,52 @@ class ConstantVelocity:
         self._stamp_s = stamp_s
 
     def hold(self) -> None:
-        """Forget the velocity: the last two poses do not give it, or are too old."""
+        """Forget the velocity, because the last two poses do not give one or are too old."""
         self._twist = None
 
     @property
     def velocity(self) -> tuple[float, float]:
-        """Metres per second along the map's x and y; 0 where it is unknown."""
+        """Velocity along the map's x and y, metres per second; 0 if unknown."""
         if self._twist is None:
             return 0.0, 0.0
         v = self.T_known[:3, :3] @ self._twist[:3]
         return float(v[0]), float(v[1])
 
     def _elapsed(self, stamp_s: float) -> float | None:
-        """Return the time since the last known pose; None where the clock has jumped since."""
+        """Return the time since the last known pose; None if the clock has jumped since."""
         step_s = self.step(stamp_s)
         return None if step_s is None or self._since_s is None else self._since_s + step_s
 
 
 class Odometry(ConstantVelocity):
-    """The next motion is what the odometry says; beyond its last entry, constant velocity.
+    """Predict the motion from odometry; beyond its last entry, at constant velocity.
 
-    Where the odometry's times go back, a new run begins; the motion between two runs is not known.
+    A step back in the odometry's times begins a new run; the motion between two runs is unknown.
 
     Parameters
     ----------
     T_map_base : (4, 4)
         The first pose.
     odometry
-        Gives what is known now: poses in any fixed frame, in order of time within each run.
+        Returns the poses received so far, in any fixed frame, ordered by time within each run.
     """
 
     def __init__(self, T_map_base: Matrix, odometry: Callable[[], Trajectory]) -> None:
         super().__init__(T_map_base)
         self._odometry = odometry
-        self._run = 0  # of the odometry, that the scans have come to
+        self._run = 0  # run of the odometry that the scans have reached
 
     def predict(self, stamp_s: float) -> Matrix:
-        """Return the probable (4, 4) pose at a time, seconds."""
+        """Return the predicted (4, 4) pose at a time, seconds."""
         motion = self._motion(stamp_s)
         return super().predict(stamp_s) if motion is None else np.asarray(self.T_known @ motion, np.float64)
 
     def is_blind(self, stamp_s: float) -> bool:
-        """Whether neither odometry nor a velocity says how the vehicle has moved."""
+        """Whether the vehicle's motion is known neither from odometry nor from a velocity."""
         return super().is_blind(stamp_s) and self._motion(stamp_s) is None
 
     def correct(self, stamp_s: float, T_map_base: Matrix | None) -> None:
-        """Learn where a scan was taken; None: as far as odometry says from the last known pose."""
+        """Record the pose of a scan; None: extend the last known pose by odometry."""
         if T_map_base is None and (motion := self._motion(stamp_s)) is not None:
             T_map_base = np.asarray(self.T_known @ motion, np.float64)
         if self._stamp_s is not None and stamp_s < self._stamp_s:
@@ -151,7 +151,7 @@ class Odometry(ConstantVelocity):
         super().correct(stamp_s, T_map_base)
 
     def _motion(self, stamp_s: float) -> Matrix | None:
-        """Return the motion since the last scan, (4, 4); None where the odometry does not have it."""
+        """Return the motion since the last scan, (4, 4); None if the odometry does not cover it."""
         if self._stamp_s is None or self._since_s != 0.0 or stamp_s <= self._stamp_s:
             return None
         known = self._odometry()
@@ -170,12 +170,12 @@ MotionPrediction = ConstantVelocity
 
 
 def twist_between(T_before: Matrix, T_after: Matrix, seconds: float) -> NDArray[np.float64]:
-    """Return the velocity that leads from one pose to another, (6,), metres and radians per second."""
+    """Return the constant velocity from one pose to another, (6,), metres and radians per second."""
     return _motion(np.linalg.inv(T_before) @ T_after) / seconds
 
 
 def first_twist(drive: Trajectory) -> NDArray[np.float64] | None:
-    """Return the velocity at the first pose of a drive; None where the first two times do not say it."""
+    """Return the velocity at the first pose of a drive; None if the first two times do not give it."""
     seconds = float(drive.stamps_s[1] - drive.stamps_s[0]) if len(drive) > 1 else 0.0
     if not 0.0 < seconds <= LONGEST_STEP_S:
         return None
@@ -183,14 +183,14 @@ def first_twist(drive: Trajectory) -> NDArray[np.float64] | None:
 
 
 def twist_on_route(route: Trajectory, T_map_base: Matrix) -> NDArray[np.float64] | None:
-    """Return the velocity of a vehicle that is on a route as its times say; None where they do not say it.
+    """Return the velocity of a vehicle on a timed route; None if the route's times do not give it.
 
     Parameters
     ----------
     route
-        Poses that will be passed; only places and times are used.
+        Poses along the route; only positions and times are used.
     T_map_base : (4, 4)
-        Where it is.
+        Pose of the vehicle.
     """
     away = np.linalg.norm(route.T_map_sensor[:, :2, 3] - T_map_base[:2, 3], axis=1)
     nearest = min(int(np.argmin(away)), max(0, len(route) - 2))
@@ -204,7 +204,7 @@ def twist_on_route(route: Trajectory, T_map_base: Matrix) -> NDArray[np.float64]
 
 
 def interpolate(trajectory: Trajectory, stamp_s: float) -> Matrix | None:
-    """Return the pose at a time between two entries; None outside of them."""
+    """Return the interpolated pose at a time; None before the first or after the last entry."""
     stamps = trajectory.stamps_s
     if not len(stamps) or stamp_s < stamps[0] or stamp_s > stamps[-1]:
         return None
@@ -222,7 +222,7 @@ def _motion(T: Matrix) -> NDArray[np.float64]:
     axis = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
     sine, cosine = float(np.linalg.norm(axis)) / 2.0, (float(np.trace(R)) - 1.0) / 2.0
     angle = math.atan2(sine, cosine)
-    # near half a turn the axis is lost; no vehicle turns so far between two scans
+    # near half a turn the axis is undefined; no vehicle turns that far between two scans
     scale = 0.5 if sine < 1e-9 else angle / (2.0 * sine)
     return np.concatenate([T[:3, 3], axis * scale])
 

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses over ZeroMQ, one msgpack message each: what localization publishes, and odometry that it gets.
+"""Poses over ZeroMQ, one msgpack message each: poses that localization publishes, and odometry it receives.
 
 A message is ``{"shmmap_pose": 1, "name", "stamp_s", "T" (16 numbers, rows of T_map_base), "converged",
 "trustworthy", "iterations", "transform_probability", "nvtl", "no_map", "state", "failed_limits"}``, the last
 three as in `frame_document`; of odometry only ``stamp_s`` and ``T`` are read.
 
-The sender binds and knows its subscribers: if it waits for one before the first message, that one misses
-none as long as it stays less than 1000 messages behind.
+The sender binds, and can wait for a subscriber before the first message.  This subscriber then misses no
+message as long as it is less than 1000 messages behind.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from shmmap_clients.streams import Publisher, Subscriber
 __all__ = ["OdometrySubscriber", "PoseMessage", "PosePublisher", "decode_pose"]
 
 _VERSION = 1
-_QUEUE = 1000  # messages that wait for a slow reader; what comes meanwhile is lost
+_QUEUE = 1000  # messages queued for a slow reader; further messages are dropped
 _LINGER_MS = 2000
 _POLL_MS = 100
-_RESTARTED_S = 1.0  # back by more is no message that was overtaken
+_RESTARTED_S = 1.0  # a larger step back is a restart, not a reordered message
 _KEPT = 1000  # odometry entries: ten seconds at 100 Hz
 
 
@@ -59,7 +59,7 @@ def decode_pose(message: bytes) -> PoseMessage:
     Raises
     ------
     BadRequest
-        It is none.
+        The message is not a pose.
     """
     try:
         pose = _decoder.decode(message)
@@ -74,7 +74,7 @@ def decode_pose(message: bytes) -> PoseMessage:
 
 
 class PosePublisher(Publisher):
-    """Binds an endpoint and publishes a message per scan.
+    """Publisher that binds an endpoint and sends a message per scan.
 
     Raises
     ------
@@ -105,12 +105,12 @@ class PosePublisher(Publisher):
 
 
 class OdometrySubscriber:
-    """Collects odometry from an endpoint in a thread of its own.
+    """Subscriber that collects odometry from an endpoint in its own thread.
 
     Raises
     ------
     BadRequest
-        The address makes no sense.
+        The address is invalid.
     """
 
     def __init__(self, endpoint: str) -> None:
@@ -129,13 +129,13 @@ class OdometrySubscriber:
         self._subscriber.close()
 
     def wait_until(self, stamp_s: float, timeout_s: float) -> bool:
-        """Wait for odometry of this time or later; False if none came within the timeout."""
+        """Wait for odometry of this time or later; return False on timeout."""
         with self._arrived:
             return self._arrived.wait_for(lambda: self._latest_s >= stamp_s, timeout_s)
 
     @property
     def trajectory(self) -> Trajectory:
-        """The odometry so far, in order of time."""
+        """The odometry received so far, ordered by time."""
         with self._arrived:
             entries = sorted(self._entries, key=lambda entry: entry.stamp_s)
         poses = np.array([entry.T for entry in entries]).reshape(-1, 4, 4)
@@ -153,7 +153,7 @@ class OdometrySubscriber:
     def _take(self, entry: PoseMessage) -> None:
         with self._arrived:
             if entry.stamp_s < self._latest_s - _RESTARTED_S:
-                self._entries.clear()  # its clock was set back, or it began again
+                self._entries.clear()  # the sender's clock was set back, or the sender restarted
                 self._latest_s = -math.inf
             self._entries.append(entry)
             del self._entries[:-_KEPT]

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The map around a moving vehicle, kept by Autoware's rules: no scan waits for an update.
 
-`MapUpdater` has a thread that asks the daemon when the vehicle has moved ``update_distance``, and makes
-the next `VoxelMap` beside the one in use (map_update_module of autoware_core does the same with a second
-NDT object).  The caller gets whichever is newest; taking it is an assignment.  Only the first map, and one
-that came too late (``distance + lidar_radius > map_radius``), is waited for.
+`MapUpdater` has a thread that sends a request to the daemon when the vehicle has moved ``update_distance``.
+It builds the next `VoxelMap` while the current one is in use (map_update_module of autoware_core does the
+same with a second NDT object).  The caller always gets the newest map, without copying.  It waits only for
+the first map, and for one that is late (``distance + lidar_radius > map_radius``).
 """
 
 from __future__ import annotations
@@ -30,35 +30,35 @@ from shmmap_clients.spread import RunningSpread
 
 __all__ = ["MapRules", "MapUpdater", "UpdateStatistics"]
 
-_REFRESH_S: Final = 1.0  # Autoware's timer; also how soon a changed map is noticed
-_STEP_S: Final = 5.0  # how often the daemon is asked whether a map is still being loaded
+_REFRESH_S: Final = 1.0  # Autoware's timer; also the longest delay until a changed map is noticed
+_STEP_S: Final = 5.0  # interval of asking the daemon whether a map is still being loaded
 _ARRIVAL_S: Final = 60.0
 
 
 class UpdateStatistics:
-    """What the changes of the map in use were like.
+    """Statistics of the changes of the map in use.
 
     Attributes
     ----------
     updates
-        How many there were.
+        Number of changes.
     added, removed
-        Cells, over all of them.
+        Cells added and removed by all changes.
     request_ms
-        From asking until the daemon's cells were attached, milliseconds.
+        Time from the request until the daemon's cells are attached, milliseconds.
     build_ms
-        For the map beside the one in use, milliseconds.
+        Time to build the next map, milliseconds.
     prepare_ms
-        The part of it in which the backend got ready: covariances, tables, writing to a device.
+        Part of ``build_ms`` in which the backend prepares: covariances, tables, writes to a device.
     private_bytes
-        This process's own memory for a map, at most.
+        Largest private memory of this process for a map.
     uploads
-        What was written to a device, also for a map that had to be written again.
+        Counts of writes to a device, including maps written again.
 
     Parameters
     ----------
     uploads
-        Where that is counted.
+        Object that has these counts.
     """
 
     def __init__(self, uploads: UploadStatistics | None = None) -> None:
@@ -100,16 +100,16 @@ class MapRules:
     update_distance
         Metres moved since the last request, after which the next is due.
     map_radius
-        Of the area that is asked for, metres (a square of that half-side, Autoware's area test).
+        Half-side of the requested square, metres (Autoware's area test).
     lidar_radius
-        How far the scanner sees, metres: the area should reach beyond that.
+        Range of the scanner, metres; the requested area should reach beyond it.
     leaf
         Edge of a voxel, metres.
     max_voxels, max_bytes
         Limits on the map, see `VoxelMap`.
     wait_s
-        How long a map that has to be waited for may take, from when the daemon last said that it is being
-        loaded: the first time kernels are compiled for it, on a slow machine for minutes.
+        Timeout of a wait for a map, seconds, counted from the daemon's last report that it is still loading.
+        The first load compiles kernels, which takes minutes on a slow machine.
     """
 
     update_distance: float = 20.0
@@ -132,27 +132,27 @@ class MapRules:
 
     @property
     def layer(self) -> str:
-        """The layer that is asked for."""
+        """Name of the requested layer."""
         return canonical_layer(f"ndt(leaf={self.leaf!r})")
 
 
 class MapUpdater:
-    """Keeps a `VoxelMap` around a pose.
+    """Updater of the `VoxelMap` around a pose.
 
     Parameters
     ----------
     client
-        A session with the daemon, or a socket as in `shmmap.connect`: then it has a session of its own.
+        A session with the daemon, or a socket as in `shmmap.connect` for a session of its own.
     rules
     prepare
-        Called in the updater's thread with each new map; computes what alignments need of it.
+        Called in the updater's thread with each new map, to prepare it for alignments.
     uploads
-        Where ``prepare`` counts what it writes to a device, `NdtMatcher.uploads`; for the statistics.
+        Counts of writes to a device by ``prepare``, for the statistics: `NdtMatcher.uploads`.
     name
-        Of its own session, for ``shmmap clients``.
+        Name of its own session in ``shmmap clients``.
     route
-        The path that the vehicle will take, (N, 2), metres, map frame, as far as it is known: the daemon
-        fetches what lies along it before it is asked for.
+        Known path ahead of the vehicle, (N, 2), metres, map frame; the daemon prefetches the cells along
+        it.
 
     Raises
     ------
@@ -181,7 +181,7 @@ class MapUpdater:
             self.rules.map_radius,
             layers=self.rules.layer,
             shape="square",
-            update_distance=0.0,  # when to ask is decided here
+            update_distance=0.0,  # this class decides when to ask
             refresh_interval=_REFRESH_S,
             background=False,
             name=name,
@@ -192,7 +192,7 @@ class MapUpdater:
         self._asked: tuple[float, float, float, float] | None = None
         self._failed: tuple[float, float, float, float] | None = None
         self._error: ShmmapError | None = None
-        self._loading_s = -math.inf  # when the daemon last said that it loads
+        self._loading_s = -math.inf  # time of the daemon's last report that it is loading
         self._closing = False
         self._busy = False
         self._thread = threading.Thread(target=self._run, name="ndt-map", daemon=True)
@@ -207,7 +207,7 @@ class MapUpdater:
         self.close()
 
     def close(self) -> None:
-        """End the thread, and the session if it is its own; a map taken before stays readable."""
+        """End the thread and its own session, if any; maps already returned stay readable."""
         with self._changed:
             self._closing = True
             self._changed.notify_all()
@@ -216,30 +216,29 @@ class MapUpdater:
 
     @property
     def error(self) -> ShmmapError | None:
-        """Why the last update failed; None if it did not."""
+        """Error of the last update; None if it succeeded."""
         return self._error
 
     def map_at(
         self, x: float, y: float, *, vx: float = 0.0, vy: float = 0.0, jumped: bool = False
     ) -> tuple[VoxelMap, bool]:
-        """Return the newest map, and whether it had to be waited for.
+        """Return the newest map, and whether the call had to wait for it.
 
-        Where the daemon's map has nothing around the place, this is a `VoxelMap` without cells.
+        If the daemon's map has no cells around the position, the `VoxelMap` is empty.
 
         Parameters
         ----------
         x, y
-            Where the vehicle is, metres, map frame.
+            Position of the vehicle, metres, map frame.
         vx, vy
-            Its velocity, metres per second: what lies ahead is loaded before it is asked for.
+            Velocity of the vehicle, metres per second, for prefetching cells ahead.
         jumped
-            The pose was corrected: that the map does not reach so far does not count as ``too_slow``.
+            Whether the pose was corrected; a map that does not reach it then is not counted as ``too_slow``.
 
         Raises
         ------
         NoAnswer
-            There is no map that reaches far enough, and for ``wait_s`` the daemon has not said that one is
-            being loaded.
+            No map reaches far enough, and the daemon has not reported any loading for ``wait_s``.
         ShmmapError
             The first map could not be loaded.
         """
@@ -262,7 +261,7 @@ class MapUpdater:
             return self._latest[0], not reached
 
     def wait_until_current(self, timeout_s: float) -> bool:
-        """Wait until everything asked for has been answered; False if it was not in time."""
+        """Wait until all requests have been answered; return False on timeout."""
         with self._changed:
             return self._changed.wait_for(lambda: self._asked is None and not self._busy, timeout_s)
 
@@ -298,7 +297,7 @@ class MapUpdater:
                 if asked is None and self._failed is not None:
                     asked = self._failed
                 elif asked is None and self._latest is not None:
-                    asked = (*self._latest[1], *self._velocity)  # has the map itself changed?
+                    asked = (*self._latest[1], *self._velocity)  # to detect a change of the map itself
                 self._failed = None
             if asked is not None:
                 self._update(*asked)
@@ -309,7 +308,7 @@ class MapUpdater:
     def _update(self, x: float, y: float, vx: float, vy: float) -> None:
         try:
             self._follow(x, y, vx, vy)
-        except Exception as error:  # noqa: BLE001  # a thread that ended would keep all scans waiting
+        except Exception as error:  # noqa: BLE001  # all scans would wait for a dead thread
             with self._changed:
                 if isinstance(error, ShmmapError):
                     self._error = error
@@ -355,11 +354,11 @@ class MapUpdater:
             self._error = None
             self._latest = (voxel_map, (x, y))
             if self._asked is not None and self._distance(*self._asked[:2]) <= self.rules.update_distance:
-                self._asked = None  # asked again while this was on its way
+                self._asked = None  # asked again during this request
             self._changed.notify_all()
 
     def _loaded(self, x: float, y: float, vx: float, vy: float) -> tuple[Cell, ...]:
-        """Wait for the window's cells; those of which none follows another for long are left out."""
+        """Wait for the window's cells; stop when no further cell arrives for long."""
         arrived_s = time.monotonic()
         while True:
             update = self._window.move_to(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The Gaussians of map cells, and many cells as one map without a copy: a small table of where they lie.
+"""The Gaussians of map cells, and a map of many cells without a copy, by a small table of addresses.
 
 A kernel compiled once cannot take 256 mappings as arguments.  It takes the *table* instead: per cell
 the addresses of three arrays and the cell's lattice box, 13 integers.  All cells of one leaf size share
@@ -7,9 +7,9 @@ one global lattice, so that a point's lattice index is right for every cell; the
 each lattice column (i, j), which cells have it.  A column on a border belongs to both cells, and their
 voxels are never merged: both Gaussians count, as in Autoware.
 
-Private memory: 210 bytes a cell, 4 bytes a lattice column; and 48 bytes a voxel where the covariances
-are not those that the cells hold.  A next map takes the addresses of the cells that it has in common with
-the last one from there, in arrays: Python's own integers would take several times as much.
+Private memory: 210 bytes a cell, 4 bytes a lattice column, and 48 bytes a voxel where the covariances
+differ from those of the cells.  A new map copies the addresses of shared cells from the last one, in
+arrays: Python's own integers would take several times as much memory.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ __all__ = ["TABLE_COLUMNS", "Covariance", "VoxelCell", "VoxelMap", "cell_from_la
 
 _COLUMNS: Final = ("table", "mean", "inverse_covariance", "scatter", "count")
 Covariance = Literal["autoware", "pclomp", "pcl"]
-TABLE_COLUMNS: Final = 13  # addresses of lattice, mean, inverse; then those of `VoxelMap.boxes`
+TABLE_COLUMNS: Final = 13  # addresses of lattice, mean, inverse; then the columns of `VoxelMap.boxes`
 _ADDRESSES: Final = 3
 _MAX_COLUMNS: Final = 1 << 22  # 16 MiB of directory: 2 km x 2 km at 1 m
 Inverses = dict[Covariance, NDArray[np.float64]]
@@ -46,9 +46,9 @@ class VoxelCell:
     leaf
         Edge of a voxel, metres.
     origin : (3,) float64
-        What ``mean`` is relative to, metres, map frame.
+        Origin of ``mean``, metres, map frame.
     lattice : (ni, nj, nk) int32, any strides
-        Row of the voxel at each place of the cell's lattice box, -1 where there is none.
+        Row of the voxel at each place of the cell's lattice box, -1 for no voxel.
     lattice_origin : (3,) int64
         Lattice index of ``lattice[0, 0, 0]``; the lattice itself starts at the map frame's origin.
     count : (V,) uint32
@@ -58,9 +58,9 @@ class VoxelCell:
     scatter : (V, 6) float64
         xx xy xz yy yz zz of the sum of (x - mean)(x - mean)^T, square metres.
     inverse : (V, 6) float64
-        Inverse covariance in Autoware's variant, xx xy xz yy yz zz, 1/m^2; zero where refused.
+        Inverse covariance in Autoware's variant, xx xy xz yy yz zz, 1/m^2; zero where the variant refuses it.
     memory
-        What the arrays belong to.
+        Owner of the arrays' memory.
     """
 
     leaf: float
@@ -75,12 +75,12 @@ class VoxelCell:
 
     @property
     def map_bytes(self) -> int:
-        """Bytes that matching needs of it: lattice, means and inverse covariances."""
+        """Bytes that matching reads: lattice, means and inverse covariances."""
         return self.lattice.nbytes + self.mean.nbytes + self.inverse.nbytes
 
 
 def voxel_cell(points: NDArray[np.generic], leaf: float, *, min_points: int = 6) -> VoxelCell:
-    """Compute the Gaussians of a cloud, as the daemon's ``ndt`` layer has them.
+    """Compute the Gaussians of a cloud, equal to the daemon's ``ndt`` layer.
 
     Parameters
     ----------
@@ -102,17 +102,17 @@ def voxel_cell(points: NDArray[np.generic], leaf: float, *, min_points: int = 6)
 
 
 def cell_from_layer(layer: LayerTable | Cell) -> VoxelCell:
-    """Return the Gaussians of an ``ndt`` layer, over the same memory.
+    """Return the Gaussians of an ``ndt`` layer as views of its memory.
 
     Parameters
     ----------
     layer
-        As `shmmap.layers.build_layer` or the daemon gave it.
+        Layer from `shmmap.layers.build_layer` or the daemon.
 
     Raises
     ------
     BadRequest
-        It is no ``ndt`` layer.
+        The layer is not an ``ndt`` layer.
     """
     from shmmap import Cell
 
@@ -140,32 +140,32 @@ def cell_from_layer(layer: LayerTable | Cell) -> VoxelCell:
 
 
 class VoxelMap:
-    """The cells a scan is matched against; immutable, so that a successor can be made beside it.
+    """The cells that a scan is matched against; immutable, so that another thread can build the next map.
 
     Parameters
     ----------
     cells
-        By any key; their order is the order of summation.
+        Cells by any key; their order is the order of summation.
     max_voxels, max_bytes
-        Cells nearest to ``centre`` are taken until the next would exceed one of these; the others are left
+        Limits: cells nearest to ``centre`` are taken until the next would exceed one; the others are left
         out and counted.  Bytes are `VoxelCell.map_bytes`.
     centre
         (x, y), metres, map frame; by default the middle of all cells.
     previous
-        A map whose derived tables are used again for the cells that both have.
+        A map whose derived tables are reused for the cells in both maps.
     derived
-        Inverse covariances, by a cell's key and their kind, that were computed elsewhere.
+        Precomputed inverse covariances, by a cell's key and their kind.
 
     Attributes
     ----------
     boxes : (C, 10) int64
-        Of each cell in order: lattice index of its first place (i0, j0, k0), how many heights it has, steps
-        of its lattice array along i, j and k, voxels, columns along i and along j.
+        For each cell in order: lattice index of its first place (i0, j0, k0), number of heights, strides
+        of its lattice array along i, j and k, number of voxels, columns along i and along j.
 
     Raises
     ------
     BadRequest
-        Cells have different leaf sizes, or lie so far apart that the directory would not be small.
+        Cells have different leaf sizes, or lie so far apart that the directory would be too large.
     """
 
     def __init__(
@@ -204,7 +204,7 @@ class VoxelMap:
             self._inherit(previous)
 
     def _inherit(self, previous: VoxelMap) -> None:
-        """Take over the addresses of the cells that a previous map has, too, and the rows they go to."""
+        """Record the addresses of cells that the previous map also has, and their rows in this map."""
         places = {key: row for row, key in enumerate(previous.cells)}
         same = np.array(
             [
@@ -218,7 +218,7 @@ class VoxelMap:
             self._inherited[covariance] = same[:, 0], table[same[:, 1], :_ADDRESSES]
 
     def inverses(self, key: str, covariance: Covariance) -> NDArray[np.float64]:
-        """Return (V, 6) inverse covariances of a cell; its own where it holds them already."""
+        """Return (V, 6) inverse covariances of a cell; the cell's own array if it has this kind."""
         cell = self.cells[key]
         if covariance == "autoware":
             return cell.inverse
@@ -230,7 +230,7 @@ class VoxelMap:
         return derived[covariance]
 
     def table(self, covariance: Covariance) -> NDArray[np.int64]:
-        """Return the kernel's table, (C, `TABLE_COLUMNS`); valid as long as this map lives."""
+        """Return the kernel's table, (C, `TABLE_COLUMNS`); valid as long as this map exists."""
         table = self._tables.get(covariance)
         if table is None:
             table = np.zeros((len(self.cells), TABLE_COLUMNS), np.int64)
@@ -250,7 +250,7 @@ class VoxelMap:
 
     @property
     def private_bytes(self) -> int:
-        """Bytes of this process's own memory that the map takes."""
+        """Private memory of this process for the map, bytes."""
         return (
             self.column_start.nbytes
             + self.column_cell.nbytes
@@ -295,7 +295,7 @@ def _boxes(cells: Sequence[VoxelCell]) -> NDArray[np.int64]:
 def _directory(
     all_boxes: NDArray[np.int64],
 ) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.int32]]:
-    """Return (i0, j0, ni, nj), where each column's cells start, and the cells."""
+    """Return (i0, j0, ni, nj), the start of each column's cells, and these cells."""
     boxes = [
         (index, i, j, di, dj)
         for index, (i, j, _, _, _, _, _, voxels, di, dj) in enumerate(all_boxes.tolist())

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pose vectors, how they are scored, and what one is worth: score, gradient and Hessian.
+"""Pose vectors, and their evaluation: score, gradient and Hessian.
 
 A pose vector is (x, y, z, roll, pitch, yaw), metres and radians, with R = Rx(roll) Ry(pitch) Rz(yaw), as
-PCL, ndt_omp and Autoware have it.
+in PCL, ndt_omp and Autoware.
 
 For a neighbour with inverse covariance C and offset d = Rx + t - mean, q = C d and w = d1 d2 exp(-d2/2 d.q),
 gradient and Hessian need only A = sum w q and B = sum w (C - d2 q q^T) per point: the derivatives J of
 Rx + t follow from x alone, so that J^T A and J^T B J are formed once per point, and everything that is linear
-in x is contracted once per evaluation.  That is 33 sums instead of a 6 x 6 matrix per neighbour; every
-backend brings these, see `SUMS`.
+in x is contracted once per evaluation.  Each backend computes these 33 sums, see `SUMS`, instead of a
+6 x 6 matrix per neighbour.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ __all__ = [
 
 Neighbors = Literal["direct1", "direct7", "radius"]
 
-# Where each sum lies in a row.
+# Index of each sum in a row.
 SCORE: Final = 0
 NEAREST: Final = 1
 FOUND: Final = 2
@@ -63,9 +63,9 @@ AX: Final = slice(9, 18)
 B: Final = slice(18, 24)
 BJ: Final = slice(24, 33)
 JBJ: Final = slice(33, 39)
-SUMS: Final = 40  # a row, padded to whole cache lines
+SUMS: Final = 40  # numbers in a row, padded to whole cache lines
 
-CHUNK_POINTS: Final = 128  # summed in one go; fixed, so that the number of threads changes nothing
+CHUNK_POINTS: Final = 128  # summed together; fixed, so that results do not depend on threads
 NEGLIGIBLE_EXPONENT: Final = 36.7  # exp(-36.7) is less than half a unit in the last place of 1
 
 _OUTLIER_RATIO: Final = 0.55
@@ -73,20 +73,20 @@ _OUTLIER_RATIO: Final = 0.55
 
 @dataclass(frozen=True, slots=True)
 class Scoring:
-    """How poses are scored.
+    """Parameters of the score of a pose.
 
     Attributes
     ----------
     neighbors
-        The voxels that a point is scored against: the one that it lies in (``"direct1"``), that and those at
-        its six faces (``"direct7"``), or all whose mean is within one leaf (``"radius"``).
+        The voxels that a point is scored against: its own voxel (``"direct1"``), also the six voxels at
+        its faces (``"direct7"``), or all voxels whose mean is within one leaf (``"radius"``).
     covariance
-        How voxels' covariances come from their moments.
+        Rule that derives voxels' covariances from their moments.
     pitch_sign
-        Sign of the sine in the second derivative after pitch: -1 is right, +1 is what ndt_omp has.
+        Sign of the sine in the second derivative by pitch: -1 is right, ndt_omp uses +1.
     deadline_s
-        Of `time.monotonic`: until when a device is waited for; after that, `DeviceHung` is raised.  None: no
-        limit but the backend's own.
+        Deadline on `time.monotonic` for a device; after it, `DeviceHung` is raised.  None: only the
+        backend's own limit.
     """
 
     neighbors: Neighbors
@@ -149,7 +149,7 @@ def search_columns(neighbors: str) -> NDArray[np.int64]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evaluation:
-    """What one pose is worth.
+    """Evaluation of one pose.
 
     Attributes
     ----------
@@ -157,15 +157,15 @@ class Evaluation:
         Sum over points and neighbours of -d1 exp(...).
     gradient : (6,) float64
     hessian : (6, 6) float64
-        Of the score after the pose vector.
+        Second derivatives of the score by the pose vector.
     nearest
-        Sum over points of the best neighbour's share.
+        Sum over points of the best neighbour's term.
     found
-        Points with at least one neighbour.
+        Number of points with at least one neighbour.
     neighbours
-        Neighbours over all points.
+        Number of neighbours over all points.
     cut_points, cut_neighbours
-        Points that had more neighbours than the limit, and how many were left out.
+        Number of points with more neighbours than the limit, and of neighbours left out.
     """
 
     score: float
@@ -184,4 +184,4 @@ class Evaluation:
 
 
 NOTHING: Final = Evaluation(0.0, np.zeros(6), np.zeros((6, 6)), 0.0, 0, 0, 0, 0)
-"""What a pose without any neighbour is worth."""
+"""Evaluation of a pose without any neighbour."""

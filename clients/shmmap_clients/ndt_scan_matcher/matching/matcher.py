@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`NdtMatcher`: aligns scans with a map of Gaussians, and says how long that takes at most."""
+"""`NdtMatcher`: aligns scans with a map of Gaussians, and predicts the longest time of an alignment."""
 
 from __future__ import annotations
 
@@ -49,19 +49,19 @@ __all__ = ["NdtMatcher", "Regularization"]
 
 _REPEATS = 3
 _REACH: Final = {"direct1": 1, "direct7": 7, "radius": 27}
-_SHARED_PLACES: Final = 4  # at a corner of four cells each has its own voxel in one lattice place
+_SHARED_PLACES: Final = 4  # where four cells meet, each has its own voxel in the same lattice place
 
 
 @dataclass(frozen=True, slots=True)
 class Regularization:
-    """A weak pull towards another estimate of where the vehicle is along its heading, as in Autoware.
+    """A weak pull along the heading towards another estimate of the position, as in Autoware.
 
-    It adds -scale * neighbours * (longitudinal distance)^2 to the score.
+    Adds -scale * neighbours * (longitudinal distance)^2 to the score.
 
     Attributes
     ----------
     x, y
-        The other estimate (of GNSS, say), metres, map frame.
+        The other estimate (from GNSS, for example), metres, map frame.
     scale
         ``regularization_scale_factor`` in Autoware, 0.01 by default there.
     """
@@ -88,25 +88,25 @@ class Regularization:
 
 
 class NdtMatcher:
-    """Aligns scans with a map; buffers are allocated once, here.
+    """Scan matcher for a map; its constructor allocates all buffers.
 
     Parameters
     ----------
     settings
     limits
     trust
-        What a result has to reach to be trusted.
+        Limits that a trusted result must meet.
     backend
-        Another one than the settings name.
+        Backend to use instead of the one that the settings name.
     threads
-        Results do not depend on it.
+        Number of threads; results do not depend on it.
 
     Raises
     ------
     BadRequest
-        A setting makes no sense.
+        A setting is invalid.
     DeviceError
-        There is no such device, or it cannot do what settings and limits ask for.
+        There is no such device, or it does not meet the settings and limits.
     """
 
     def __init__(
@@ -123,7 +123,7 @@ class NdtMatcher:
         self._trust = trust if trust is not None else TrustLimits()
         self._variant = variant_named(self.settings.variant)
         self._rule = rule_of(self.settings, self._variant, self.limits)
-        self._rules = [self._rule]  # of the stages of an alignment
+        self._rules = [self._rule]  # one for each stage of an alignment
         if self.settings.mode == "coarse_fine":
             fine, epsilon = replace(VARIANTS["pcl"], stop="step"), self.settings.fine_epsilon
             self._rules.append(replace(self._rule, variant=fine, epsilon=epsilon, line_search=False))
@@ -157,47 +157,47 @@ class NdtMatcher:
 
     @property
     def backend_name(self) -> str:
-        """Name of what computes."""
+        """Name of the backend that computes."""
         return self._backend.name
 
     @property
     def on_device(self) -> bool:
-        """Whether the work is done elsewhere than in threads of this process."""
+        """Whether a device does the work, not threads of this process."""
         return self._backend.on_device
 
     @property
     def fault(self) -> DeviceError | None:
-        """Why the fallback computes; None as long as it does not."""
+        """Reason why the fallback computes; None while it does not."""
         return self._backend.fault
 
     @property
     def uploads(self) -> UploadStatistics:
-        """What was written to a device for maps; it goes on counting."""
+        """Counts of writes of maps to a device; the object is updated in place."""
         return self._backend.uploads
 
     @property
     def neighbors(self) -> Neighbors:
-        """Which voxels a point is scored against."""
+        """Kind of neighbour search: the voxels that a point is scored against."""
         return self._neighbors
 
     @property
     def trust(self) -> TrustLimits:
-        """What a result has to reach to be trusted, with the map's leaf."""
+        """Limits that a trusted result must meet, for the map's leaf."""
         return self._trust_in_force
 
     @property
     def map(self) -> VoxelMap:
-        """What scans are matched against."""
+        """The map that scans are matched against."""
         return self._map
 
     def set_map(self, voxel_map: VoxelMap) -> None:
-        """Match against this map from now on; takes microseconds where its tables are prepared."""
+        """Match against this map from now on; takes microseconds if the map is prepared."""
         self._map = voxel_map
         self._trust_in_force = self._trust.for_leaf(voxel_map.leaf, fine=self.settings.mode == "coarse_fine")
         self._backend.set_map(voxel_map)
 
     def prepare(self, voxel_map: VoxelMap) -> VoxelMap:
-        """Compute what alignments will need of a map, so that none of them waits for it; from any thread."""
+        """Compute the tables of a map in advance, so that no alignment waits for them; from any thread."""
         for covariance in dict.fromkeys(rule.variant.covariance for rule in self._rules):
             self._backend.prepare(voxel_map, Scoring(self._neighbors, covariance))
         return voxel_map
@@ -209,23 +209,23 @@ class NdtMatcher:
         *,
         regularization: Regularization | None = None,
     ) -> Result:
-        """Find where a scan was taken.
+        """Find the pose of a scan.
 
         Parameters
         ----------
         points : (N, 3) float32 or float64
             Metres, base frame.
         T_guess : (4, 4)
-            Where it was probably taken; ``T_map_base``.
+            Initial guess of ``T_map_base``.
         regularization
-            Another estimate to be drawn to.
+            Another estimate that attracts the pose.
 
         Raises
         ------
         BadRequest
-            Shapes are wrong, or the guess is not finite.
+            A shape is wrong, or the guess is not finite.
         DeviceError
-            A device failed, or had not answered at the deadline, and there is no fallback.
+            A device failed or did not answer before the deadline, and there is no fallback.
         """
         return self.align_many(points, [T_guess], regularization=regularization)[0]
 
@@ -236,9 +236,9 @@ class NdtMatcher:
         *,
         regularization: Regularization | None = None,
     ) -> list[Result]:
-        """Align from several guesses at once: the same results as one after the other, evaluated in batches.
+        """Align from several guesses in batches, with the same results as separate alignments.
 
-        Parameters and errors are those of `align`; the deadline is that of all together.
+        Parameters and errors as in `align`; the deadline applies to all guesses together.
         """
         deadline_s = None if self.limits.deadline_s is None else time.monotonic() + self.limits.deadline_s
         guesses = [np.array(T_guess, np.float64) for T_guess in T_guesses]
@@ -259,26 +259,26 @@ class NdtMatcher:
         return [self._result(stages, used, dropped, extent) for stages in alignments]
 
     def evaluate(self, points: NDArray[np.floating], poses: NDArray[np.float64]) -> list[Evaluation]:
-        """Score a scan at several pose vectors, (k, 6), without moving them; in batches of the limit."""
+        """Score a scan at several pose vectors, (k, 6), without optimization, in batches up to the limit."""
         self._backend.set_source(points)
         variant = self._variant
         return self._evaluate(poses, Scoring(self._neighbors, variant.covariance, variant.pitch_sign))
 
     def time_bound(self, points: NDArray[np.floating], T: NDArray[np.float64]) -> TimeBound:
-        """Predict how long an alignment takes at most, from the limits and from evaluations of one scan.
+        """Predict an upper bound of an alignment's time, from the limits and evaluations of one scan.
 
         Parameters
         ----------
         points : (N, 3)
             A typical scan.
         T : (4, 4)
-            Where it lies.
+            Pose of the scan.
         """
         pose = pose_from_matrix(T)[None, :]
         costs, per_point = [], 1.0
         self.evaluate(points, pose)
         for _ in range(_REPEATS):
-            # what a device does is in no thread of this process
+            # a device's work is in no thread of this process
             clock = time.perf_counter_ns if self.on_device else time.thread_time_ns
             begin = clock()
             at = self.evaluate(points, pose)[0]
@@ -286,10 +286,10 @@ class NdtMatcher:
             per_point = max(at.neighbours / max(len(points), 1), 1.0)
         used = max(min(len(points), self.limits.source_points), 1)
         max_neighbors = min(self.limits.neighbors, _REACH[self._neighbors] * _SHARED_PLACES)
-        # what a point costs grows no faster than its neighbours
+        # the cost of a point grows at most linearly with its neighbours
         point_ns = min(costs) / used * max(1.0, max_neighbors / per_point)
         steps = self._rule.max_iterations + (2 if self._variant.stop == "step_late" else 0)
-        # a line search ends with the Hessian of where it ended
+        # a line search evaluates the Hessian at its end once more
         evaluations = 1 + steps * (MAX_TRIALS + 2 if self._rule.line_search else 1)
         if self.settings.mode == "coarse_fine":
             evaluations += 1 + self._rule.max_iterations
@@ -310,7 +310,7 @@ class NdtMatcher:
         regularization: Regularization | None,
         deadline_s: float | None,
     ) -> list[Ascent]:
-        """Climb from each guess."""
+        """Run the climb from each guess, one after the other."""
         # ndt_omp's line search ends with an evaluation that has the other sign
         scorings = {
             sign: Scoring(self._neighbors, rule.variant.covariance, sign, deadline_s) for sign in (-1.0, 1.0)
@@ -332,10 +332,10 @@ class NdtMatcher:
         regularization: Regularization | None,
         deadline_s: float | None,
     ) -> list[Ascent]:
-        """Climb from all guesses at once: the next evaluation of each goes into one batch."""
+        """Run the climbs from all guesses together, with the next evaluation of each in one batch."""
         ascents = [started(T_guess) for T_guess in guesses]
         climbs = [climb(ascent, rule, self._backend.step) for ascent in ascents]
-        # of each climb that has not ended: the pose and the pitch sign to be evaluated next
+        # for each unfinished climb: the next pose and pitch sign to evaluate
         wanted = {number: next(one) for number, one in enumerate(climbs)}
         while wanted:
             found: dict[int, Evaluation] = {}

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The line search of More and Thuente (1994) as PCL and ndt_omp have it, to the letter.
+"""The line search of More and Thuente (1994), exactly as in PCL and ndt_omp.
 
-Where the originals divide by zero they continue with an infinity or a NaN; so does this.  They differ in one
-case, see `line_search`.
+Where the originals divide by zero, they continue with an infinity or a NaN, and so does this module.  PCL
+and ndt_omp differ in one case, see `line_search`.
 """
 
 from __future__ import annotations
@@ -39,21 +39,21 @@ def line_search(
     *,
     by_upper_end: bool,
 ) -> Search:
-    """Find a step length along a descent direction, and how many trials it took after the first.
+    """Find a step length along a descent direction; return it and the number of trials after the first.
 
-    It yields each trial, a step length, and is sent the negated score and its slope there.
+    The generator yields each trial step length, and is sent the negated score and its slope there.
 
     Parameters
     ----------
     first
         Newton's own step length.
     step_min, step_max
-        Bounds of the step length; without room between them the first is taken.
+        Bounds of the step length; if they leave no room, ``first`` is taken.
     phi_0, dphi_0
         The negated score and its slope at the start; the slope is negative.
     by_upper_end
-        Where the last trial has become the lower end: PCL 1.13 takes the cubic through the upper end,
-        ndt_omp divides by zero.
+        Rule for a last trial that has become the lower end: True uses the cubic through the upper end, as
+        PCL 1.13; False divides by zero, as ndt_omp.
     """
     zero, value_0, slope_0 = np.float64(0.0), np.float64(phi_0), np.float64(dphi_0)
     with np.errstate(all="ignore"):
@@ -70,7 +70,7 @@ def line_search(
                 if opened and at_psi.f <= 0 and at_psi.g >= 0:
                     opened = False
                     for end in (low, high):
-                        # the sign before mu is that of the originals
+                        # the sign of mu is as in the originals
                         end.f = end.f + value_0 - _MU * slope_0 * end.a
                         end.g = end.g + _MU * slope_0
                 converged = _update(low, high, at_psi if opened else at_phi)
@@ -88,7 +88,7 @@ def _clip(a: float, low: float, high: float) -> float:
 
 
 def _update(low: _Point, high: _Point, at: _Point) -> bool:
-    """Shrink the interval; whether it has converged."""
+    """Shrink the interval; return whether it has converged."""
     if at.f > low.f:
         high.a, high.f, high.g = at.a, at.f, at.g
         return False
@@ -104,7 +104,7 @@ def _update(low: _Point, high: _Point, at: _Point) -> bool:
 
 
 def _cubic(end: _Point, at: _Point) -> np.float64:
-    """Minimiser of the cubic through both values and slopes, eq. 2.4.52 and 2.4.56 of Sun and Yuan 2006."""
+    """Return the minimiser of the cubic of both values and slopes, Sun and Yuan 2006, eq. 2.4.52, 2.4.56."""
     z = 3 * (at.f - end.f) / (at.a - end.a) - at.g - end.g
     w = np.sqrt(z * z - at.g * end.g)
     least: np.float64 = end.a + (at.a - end.a) * (w - end.g - z) / (at.g - end.g + 2 * w)
@@ -117,7 +117,7 @@ def _secant(end: _Point, at: _Point) -> np.float64:
 
 
 def _trial(low: _Point, high: _Point, at: _Point, by_upper_end: bool) -> float:
-    """Trial value selection, section 4 of More and Thuente 1994."""
+    """Select the next trial value, section 4 of More and Thuente 1994."""
     if by_upper_end and at.a == low.a:
         return float(at.a if at.a == high.a else _cubic(high, at))
     if at.f > low.f:

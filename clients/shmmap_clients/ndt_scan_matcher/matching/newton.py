@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Newton's method on the score: the alignment itself (algorithm 2 of Magnusson 2009).
+"""Alignment by Newton's method on the score (algorithm 2 of Magnusson 2009).
 
-Three programs differ in it (`VARIANTS`): covariances, stop rule, one sign.
+The variants of three programs (`VARIANTS`) differ in covariances, stop rule and one sign.
 """
 
 from __future__ import annotations
@@ -42,34 +42,34 @@ __all__ = [
 ]
 
 Stop = Literal["step", "step_late", "squared_translation"]
-_BACK: Final = 0.5  # negated cosine between steps of which one goes back on the other
-_MAY_LOSE: Final = 0.1  # of the score, by one steady step
+_BACK: Final = 0.5  # least negated cosine between two opposite steps
+_MAY_LOSE: Final = 0.1  # largest relative loss of score in one steady step
 Evaluate = Callable[[NDArray[np.float64], float], Evaluation]
 Step = Callable[[Evaluation, bool], NDArray[np.float64]]
 Climb = Generator[tuple[NDArray[np.float64], float], Evaluation, None]
-"""Asks for evaluations, each at a pose vector and with a pitch sign, and gets them."""
+"""Generator that yields requests, each a pose vector and a pitch sign, and is sent their evaluations."""
 
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """One program's alignment.
+    """Rules of one program's alignment.
 
     Attributes
     ----------
     name
     covariance
-        How voxels' covariances come from their moments.
+        Rule that derives voxels' covariances from their moments.
     stop
-        ``"step"``: the step's 6-norm falls below epsilon, or iterations are up.  ``"step_late"``: the same,
-        but never after the first step, and two iterations later.  ``"squared_translation"``: the step's
-        translation, squared, is at most epsilon.
+        ``"step"``: the step's 6-norm falls below epsilon, or the iteration limit is reached.
+        ``"step_late"``: the same, but never after the first step, and with two iterations more.
+        ``"squared_translation"``: the step's translation, squared, is at most epsilon.
     pitch_sign
-        Sign in the second derivative after pitch; ndt_omp has the wrong one, but not in the Hessian that
-        it computes after a line search.
+        Sign in the second derivative by pitch.  ndt_omp's is wrong, except in the Hessian after a line
+        search.
     line_search
         Whether More-Thuente's line search is the default; else Newton's step is clipped.
     neighbors, epsilon, max_iterations
-        Defaults.
+        Default values of the settings.
     """
 
     name: str
@@ -96,7 +96,7 @@ VARIANTS: Final = {
 
 
 def variant_named(name: str) -> Variant:
-    """Return one of `VARIANTS`; `BadRequest` lists them for another name."""
+    """Return one of `VARIANTS`; for any other name, raise `BadRequest` with their list."""
     if name not in VARIANTS:
         raise BadRequest(f"unknown variant {name!r}", hint=f"variants are: {', '.join(VARIANTS)}")
     return VARIANTS[name]
@@ -104,24 +104,25 @@ def variant_named(name: str) -> Variant:
 
 @dataclass(frozen=True, slots=True)
 class StepRule:
-    """How far a step goes, and when to stop.
+    """Length of steps, and when to stop.
 
     Attributes
     ----------
     variant
     epsilon
-        Metres and radians (the 6-norm of a step), as ``transformation_epsilon``; a step is at least half.
+        Threshold on the 6-norm of a step, metres and radians, as ``transformation_epsilon``; the shortest
+        step is half of it.
     max_step
-        Longest step, the same norm.
+        Longest step, in the same norm.
     max_iterations
     line_search
-        More-Thuente's instead of a clipped Newton step.
+        Whether to use More-Thuente's line search instead of a clipped Newton step.
     steady
-        The originals may swing between two places until iterations are up: where the score is not concave
-        they go back along a step that would lead down, and a step across the peak is answered by the same
-        one back.  Here curvatures count by their magnitude (saddle-free Newton, Dauphin 2014), so that every
-        step sets out upwards.  Steps may end a tenth lower, and so leave small peaks behind, until one goes
-        back on the one before, then no lower; instead of others the longest step is halved.
+        Whether to prevent oscillation.  The originals may swing between two poses up to the iteration
+        limit: where the score is not concave they reverse a step that leads down, and after a step across
+        the peak comes the same step back.  A steady step uses the magnitudes of curvatures (saddle-free
+        Newton, Dauphin 2014), so that it starts uphill.  It may end a tenth lower, to escape small peaks,
+        until a step reverses the one before; from then on no lower.  Else the longest step is halved.
     """
 
     variant: Variant
@@ -134,7 +135,7 @@ class StepRule:
 
 @dataclass(slots=True)
 class Ascent:
-    """A climb from the guess to the peak, as far as it has come."""
+    """State of a climb from the guess to the peak."""
 
     pose: NDArray[np.float64]
     transforms: list[NDArray[np.float64]]
@@ -146,7 +147,7 @@ class Ascent:
 
 
 def started(T_guess: NDArray[np.float64]) -> Ascent:
-    """Return an ascent that is still at the guess."""
+    """Return the initial state, at the guess."""
     return Ascent(pose_from_matrix(T_guess), [T_guess])
 
 
@@ -164,12 +165,12 @@ def ascend(
     ----------
     T_guess : (4, 4) float64
     evaluate
-        Gives an evaluation for a pose vector and a pitch sign.
+        Returns the evaluation of a pose vector with a pitch sign.
     rule
     step_of
-        Gives the step that an evaluation asks for, steady or not.
+        Returns the next step from an evaluation, steady or not.
     deadline_s
-        Of `time.monotonic`: no evaluation but the first begins after it.
+        Deadline on `time.monotonic`; only the first evaluation may begin after it.
     """
     ascent = started(T_guess)
     climbing = climb(ascent, rule, step_of)
@@ -182,7 +183,7 @@ def ascend(
 
 
 def climb(ascent: Ascent, rule: StepRule, step_of: Step = numpy_step) -> Climb:
-    """Climb, one evaluation after the other; a caller may run many climbs side by side, or stop."""
+    """Climb, as a generator of evaluations, so that a caller may interleave climbs or stop."""
     at = yield ascent.pose, rule.variant.pitch_sign
     ascent.last = at
     ascent.evaluations.append(at)
@@ -206,7 +207,7 @@ def climb(ascent: Ascent, rule: StepRule, step_of: Step = numpy_step) -> Climb:
             before = direction
             longest = min(2 * longest, rule.max_step)
         ascent.transforms.append(matrix_from_pose(ascent.pose))
-        # a steady step may be short because it was cut short: that is not yet the peak
+        # a steady step that was cut short does not mean that the peak is reached
         small = _is_small(ascent.iterations, wanted if rule.steady else length, direction, rule)
         small = small or (rule.steady and longest < rule.epsilon / 2.0)
         ascent.iterations += 1
@@ -223,7 +224,7 @@ def _take_step(
     rule: StepRule,
     longest: float,
 ) -> Generator[tuple[NDArray[np.float64], float], Evaluation, tuple[float, NDArray[np.float64], Evaluation]]:
-    """Return the step's length and direction, and the evaluation where it ends."""
+    """Return the step's length and direction, and the evaluation at its end."""
     sign = rule.variant.pitch_sign
     slope = -float(at.gradient @ direction)
     if slope == 0.0:
@@ -248,7 +249,7 @@ def _take_step(
             length, trials = ended.value
             break
     if trials and sign > 0:
-        # ndt_omp computes the Hessian again after a search, and there with the right sign
+        # after a search, ndt_omp computes the Hessian again, with the right sign
         latest = yield start + direction * length, -1.0
     return length, direction, latest
 
@@ -263,6 +264,6 @@ def _is_small(iterations_before: int, length: float, direction: NDArray[np.float
 
 
 def _is_last(iterations: int, rule: StepRule) -> bool:
-    # ndt_omp compares before it counts, and with "greater than"
+    # ndt_omp compares before it increments, and with "greater than"
     extra = 2 if rule.variant.stop == "step_late" else 0
     return iterations >= rule.max_iterations + extra

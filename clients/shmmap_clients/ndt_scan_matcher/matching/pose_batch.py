@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is computed once a pose, by whole-array operations: matrices, derivatives, evaluations, the next step.
+"""Computations per pose by whole-array operations: matrices, derivatives, evaluations, the next step.
 
-A pose has the same bits alone and among others.  First and second derivatives are eq. 6.19 and 6.21 of
-Magnusson 2009.
+The result of a pose is the same to the bit, alone or in a batch.  First and second derivatives
+are eq. 6.19 and 6.21 of Magnusson 2009.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ __all__ = [
     "upward_step",
 ]
 
-SMALL_ANGLE: Final = 10e-5  # below it the originals take the angle for zero in derivatives
-# what JacobiSVD of Eigen takes for zero: as many roundings as the matrix has rows
+SMALL_ANGLE: Final = 10e-5  # below it, derivatives in the originals take the angle as zero
+# threshold of zero in Eigen's JacobiSVD: as many roundings as the matrix has rows
 SINGULAR: Final = 6 * float(np.finfo(np.float64).eps)
 
-FLAT: Final = 1e-9  # least curvature over greatest that a step divides by
+FLAT: Final = 1e-9  # least ratio to the greatest curvature that a step divides by
 
-# where the Hessian's elements are among b (6), bj (9) and the rotation's (6)
+# index of the Hessian's elements among b (6), bj (9) and the rotation's (6)
 _HESSIAN: Final = np.array(
     [
         [0, 1, 2, 6, 7, 8],
@@ -92,7 +92,7 @@ def derivatives_of_poses(poses: NDArray[np.float64], pitch_sign: float = -1.0) -
     Returns
     -------
     (k, 9, 3, 3) float64
-        After roll, pitch, yaw; then roll-roll, roll-pitch, roll-yaw, pitch-pitch, pitch-yaw, yaw-yaw.
+        By roll, pitch, yaw; then roll-roll, roll-pitch, roll-yaw, pitch-pitch, pitch-yaw, yaw-yaw.
     """
     cx, sx, cy, sy, cz, sz = _sines(poses, SMALL_ANGLE)
     none = np.zeros(len(poses))
@@ -126,9 +126,9 @@ def evaluations_of(rows: NDArray[np.floating], derivatives: NDArray[np.float64])
     Parameters
     ----------
     rows : (k, chunks, SUMS)
-        Of each pose.
+        Rows of each pose.
     derivatives : (k, 9, 3, 3) float64
-        As `derivatives_of_poses` gives them.
+        Output of `derivatives_of_poses`.
     """
     number, chunks, width = rows.shape
     sums = np.zeros((number, width))
@@ -179,5 +179,5 @@ def upward_step(at: Evaluation) -> NDArray[np.float64]:
 
 
 def numpy_step(at: Evaluation, steady: bool) -> NDArray[np.float64]:
-    """Return `upward_step` if steady, else `newton_step`."""
+    """Return the next step: `upward_step` if steady, else `newton_step`."""
     return upward_step(at) if steady else newton_step(at)

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an alignment gives, what it rests on, and which results are trusted.
+"""Results of alignments, their evidence, and the limits of trusted results.
 
 NVTL is at most -d1, which grows with the leaf: 2.22 at 1 m, 4.20 at 2 m, 5.40 at 3 m.  Autoware's threshold
-of 2.3 is for its leaf of 2 m, and 0.548 of that.  The same share separates right poses from wrong ones at
-other leaf sizes.  True covariances (``coarse_fine``) fit more closely, and score lower below 2 m: there the
-share falls to 0.41 at 1 m.
+of 2.3 is for its leaf of 2 m, a share of 0.548 of the maximum.  The same share separates right poses from
+wrong ones at other leaf sizes.  True covariances (``coarse_fine``) fit more closely and score lower below
+2 m: the share falls to 0.41 at 1 m.
 
-A score says how well points fit where they lie.  A single point, a stretch of road, or what lies within a
-few metres fits in many places: `Evidence` bounds that.  The Hessian of the score is the information about the
-pose, up to a factor.  ``sharpness`` is the least curvature of the score when the scan is moved in any
-direction without being turned.  ``spread`` compares directions, with turns left free: the covariance of the
+A score measures how well points fit at a pose.  A single point, a stretch of road, or points within a few
+metres fit at many poses; limits on `Evidence` exclude such results.  The Hessian of the score is
+the information about the pose, up to a factor.  ``sharpness`` is the least curvature of the score when the
+scan is translated in any direction.  ``spread`` compares directions, with turns left free: the covariance of the
 position is the translational block of the inverse Hessian (the Schur complement of the rotations); how round
 it is depends neither on the number of points nor on units.  Degeneracy by the smallest eigenvalue: Zhang,
 Kaess and Singh, "On degeneracy of optimization-based state estimation problems", ICRA 2016; translations and
@@ -47,13 +47,13 @@ __all__ = [
 ]
 
 FAR_POINTS: Final = 20
-_ANGLE_POINTS: Final = 512  # of a scan, evenly over it: enough for its angle
+_ANGLE_POINTS: Final = 512  # points evenly over a scan, enough for its angle
 # ndt_scan_matcher.param.yaml of autoware_core: converged_param_nearest_voxel_transformation_likelihood,
 # and the oscillations of count_oscillation
 _AUTOWARE_NVTL: Final = 2.3
 _AUTOWARE_LEAF: Final = 2.0
 _MAX_OSCILLATIONS: Final = 10
-_INVERSION: Final = -0.9  # cosine between two steps that counts as going back
+_INVERSION: Final = -0.9  # cosine between two steps, below which the second is a reversal
 _SHARE: Final = _AUTOWARE_NVTL / -gauss_for(_AUTOWARE_LEAF).d1
 _FINE_SHARE: Final = 0.41  # at a leaf of 1 m and below
 _SHARPNESS: Final = 2.7
@@ -62,7 +62,7 @@ _FINE_SHARPNESS: Final = 3.4  # true covariances are narrower
 
 @dataclass(frozen=True, slots=True)
 class Extent:
-    """Where the points of a scan lie: ``distance`` and ``angle`` as in `Evidence`."""
+    """Extent of a scan's points: ``distance`` and ``angle`` as in `Evidence`."""
 
     distance: float
     angle: float
@@ -70,16 +70,16 @@ class Extent:
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What a pose rests on.
+    """Evidence for a pose.
 
     Attributes
     ----------
     points
-        Points of the scan that have a voxel of the map near.
+        Number of points of the scan with a neighbouring voxel in the map.
     distance
-        How far from the frame's origin at least `FAR_POINTS` points of the scan are, metres.
+        Distance from the frame's origin that at least `FAR_POINTS` points of the scan reach, metres.
     angle
-        How widely their headings are spread, degrees: the width of a sector, up to 281 for all around.
+        Spread of the points' headings, degrees: the width of a sector, up to 281 for all around.
     sharpness
         Least curvature of the score per matched point, over all directions: the smallest eigenvalue of the
         negated Hessian's translational block, divided by ``points`` and by the highest score of a point,
@@ -97,11 +97,11 @@ class Evidence:
 
 
 def extent_of(points: NDArray[np.floating]) -> Extent:
-    """Return where points lie, (N, 3), metres; what is not finite counts as lying at the origin.
+    """Return the extent of points, (N, 3), metres; points that are not finite count as at the origin.
 
     The angle follows from R, the mean resultant length of the headings (Mardia and Jupp, "Directional
     Statistics", 2.3.1): a sector of width w, evenly filled, has R = sin(w/2) / (w/2), about 1 - w^2/24.
-    Of fewer than `FAR_POINTS` points the distance is that of the nearest.
+    With fewer than `FAR_POINTS` points, the distance is that of the nearest.
     """
     if not len(points):
         return Extent(0.0, 0.0)
@@ -114,7 +114,7 @@ def extent_of(points: NDArray[np.floating]) -> Extent:
         cosine, sine = x / level, y / level
         known = np.isfinite(cosine + sine)
     squared[~np.isfinite(squared)] = 0.0
-    some = squared[::8]  # if enough of these are so far, nearer points need not be put in order
+    some = squared[::8]  # if enough of these are far, nearer points need not be sorted
     if len(some) >= FAR_POINTS:
         squared = squared[squared >= np.partition(some, -FAR_POINTS)[-FAR_POINTS]]
     place = max(len(squared) - FAR_POINTS, 0)
@@ -126,7 +126,7 @@ def extent_of(points: NDArray[np.floating]) -> Extent:
 
 
 def covariance_of(hessian: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Return the inverse of the negated Hessian, or None if that is not positive definite."""
+    """Return the inverse of the negated Hessian, or None if the latter is not positive definite."""
     try:
         np.linalg.cholesky(-hessian)
     except np.linalg.LinAlgError:
@@ -135,7 +135,7 @@ def covariance_of(hessian: NDArray[np.float64]) -> NDArray[np.float64] | None:
 
 
 def oscillations(transforms: NDArray[np.float64]) -> int:
-    """Count as Autoware's count_oscillation: the longest run of reversed steps."""
+    """Return the longest run of reversed steps, as Autoware's count_oscillation."""
     steps = np.diff(transforms[:, :3, 3], axis=0)
     lengths = np.linalg.norm(steps, axis=1, keepdims=True)
     units = steps / np.where(lengths > 0, lengths, 1.0)
@@ -155,20 +155,20 @@ def evidence_of(
     leaf: float,
     highest: float,
 ) -> Evidence:
-    """Return what a pose rests on.
+    """Return the evidence for a pose.
 
     Parameters
     ----------
     hessian, covariance : (6, 6) float64
-        Of the score at the pose, and the inverse of the negated; None where there is none.
+        Hessian of the score at the pose, and the inverse of the negated Hessian; None if there is none.
     extent
-        Of the scan.
+        Extent of the scan.
     points
         As in `Evidence`.
     leaf
         Edge of a voxel, metres.
     highest
-        Score of a point in the middle of a voxel.
+        Highest score of a point, in the middle of a voxel.
     """
     if covariance is None or not np.isfinite(covariance).all():
         return Evidence(points, extent.distance, extent.angle, 0.0, 0.0)
@@ -186,7 +186,7 @@ def default_nvtl(leaf: float, *, fine: bool = False) -> float:
     leaf
         Edge of a voxel, metres.
     fine
-        Whether the result is one of true covariances (``coarse_fine``).
+        Whether the result uses true covariances (``coarse_fine``).
     """
     share = _SHARE
     if fine and leaf < _AUTOWARE_LEAF:
@@ -201,16 +201,16 @@ def default_sharpness(*, fine: bool = False) -> float:
 
 @dataclass(frozen=True, slots=True)
 class TrustLimits:
-    """What a result has to reach to be trusted.
+    """Limits that a trusted result must meet.
 
-    No score detects every divergence: a pose metres away may reach them all.
+    No score detects every divergence: a pose metres off may meet all limits.
 
     Attributes
     ----------
     nvtl
         Lowest nearest-voxel transformation likelihood; None: `default_nvtl` of the map's leaf.
     transform_probability
-        Lowest transform probability; None: any.
+        Lowest transform probability; None: no limit.
     oscillations
         Most reversals of the step.
     points, distance, angle, sharpness, spread
@@ -233,7 +233,7 @@ class TrustLimits:
                 raise BadRequest(f"a limit of trust must not be negative, {limit.name} is {value}")
 
     def for_leaf(self, leaf: float, *, fine: bool = False) -> TrustLimits:
-        """Return the limits with numbers for ``nvtl`` and ``sharpness``; parameters as in `default_nvtl`."""
+        """Return the limits with their defaults filled in; parameters as in `default_nvtl`."""
         return replace(
             self,
             nvtl=default_nvtl(leaf, fine=fine) if self.nvtl is None else self.nvtl,
@@ -250,12 +250,12 @@ class TrustLimits:
         oscillations: int,
         evidence: Evidence,
     ) -> tuple[str, ...]:
-        """Return the names of what a result fails, none if it is trusted.
+        """Return the names of the limits that a result fails, none if it is trusted.
 
         Returns
         -------
         tuple of str
-            ``no_map`` alone, where there was nothing to match; else of ``converged``, ``nvtl``,
+            ``no_map`` alone if there was no map to match, else any of ``converged``, ``nvtl``,
             ``transform_probability``, ``oscillations``, ``points``, ``distance``, ``angle``, ``sharpness``,
             ``spread``.
         """
@@ -275,7 +275,7 @@ class TrustLimits:
         return tuple(name for name, fails in failed.items() if fails)
 
     def describe(self, name: str) -> str:
-        """Return in words what it means to fail a limit, as `failed` names it."""
+        """Return a description of a failed limit, by its name in `failed`."""
         return {
             "no_map": "no map",
             "converged": "not converged",
@@ -292,7 +292,7 @@ class TrustLimits:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Result:
-    """A scan's pose in the map.
+    """Result of an alignment: a scan's pose in the map.
 
     Attributes
     ----------
@@ -301,8 +301,8 @@ class Result:
     iterations
         Newton steps, counted as the variant's program counts them.
     converged
-        The last step was below epsilon, not merely the last one allowed; of the fine part where there is
-        one.
+        Whether the last step was below epsilon, not merely the last one allowed; in the fine stage if
+        there is one.
     transform_probability
         Score per point of the scan.
     nvtl
@@ -310,25 +310,24 @@ class Result:
     transforms : (k, 4, 4) float64
         The guess, then the pose after each step.
     transform_probabilities, nvtls : (m,) float64
-        Of every evaluation, in order: k of them without a line search.
+        Values at every evaluation, in order; k of them without a line search.
     hessian : (6, 6) float64
-        Of the score at the last evaluation, after (x, y, z, roll, pitch, yaw).
+        Hessian of the score at the last evaluation, by (x, y, z, roll, pitch, yaw).
     covariance : (6, 6) float64 or None
-        Laplace's approximation, the inverse of the negated Hessian; None where the score has no peak
-        there.
+        Laplace's approximation, the inverse of the negated Hessian; None if the score has no peak at the
+        pose.
     oscillations
-        Longest run of steps each of which goes back on the one before.
+        Longest run of steps that each reverse the one before.
     evaluations
-        Passes over the scan.
+        Number of passes over the scan.
     evidence
-        What the pose rests on.
+        Evidence for the pose.
     cut
-        What the limits left out.
+        Items that the limits left out.
     no_map
-        No point of the scan had a Gaussian of the map near: there was nothing to match, and the pose is the
-        guess.
+        Whether no point of the scan had a neighbouring Gaussian in the map; the pose is then the guess.
     failed_limits
-        Why the result is not trusted, as `TrustLimits.failed` names it; empty if it is.
+        Names of the failed limits, see `TrustLimits.failed`; empty if the result is trusted.
     """
 
     T_map_base: NDArray[np.float64]
@@ -350,5 +349,5 @@ class Result:
 
     @property
     def trustworthy(self) -> bool:
-        """Whether the result is within all limits of trust."""
+        """Whether the result meets all limits of trust."""
         return not self.failed_limits

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`Settings`: how to align, and what computes; `Limits`: at most how many points, steps, seconds."""
+"""`Settings`: method and backend of alignments; `Limits`: upper bounds of points, steps and time."""
 
 from __future__ import annotations
 
@@ -21,27 +21,27 @@ Mode = Literal["single", "coarse_fine"]
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Upper bounds that hold for any input; what exceeds one is left out and reported as a `Cut`.
+    """Upper bounds that hold for any input; items above a limit are left out and reported as a `Cut`.
 
     Attributes
     ----------
     source_points
-        Points of a scan; of a larger one every k-th is taken, evenly over the whole scan.
+        Points of a scan; of a larger scan every k-th point is taken, evenly over the whole scan.
     neighbors
-        Voxels that one point is scored against; the nearest are taken.  Inside one cell no search finds
-        more than 27.
+        Voxels that one point is scored against; the nearest are taken.  Within one cell, any search finds
+        at most 27.
     voxels
         Gaussians of the map; whole cells are taken, the nearest to the guess first.
     map_bytes
-        Of the map's Gaussians and lattices, see `VoxelCell.map_bytes`; whole cells, too.  Sparse cells have
-        lattices that are larger than their Gaussians.  `None`: 96 bytes for each voxel that is allowed.
+        Size of the map's Gaussians and lattices, see `VoxelCell.map_bytes`; also in whole cells.  The
+        lattice of a sparse cell is larger than its Gaussians.  `None`: 96 bytes for each allowed voxel.
     iterations
-        Newton steps; `None` leaves it to the variant.
+        Newton steps; `None`: the variant's default.
     poses
-        That are evaluated at once; more are evaluated in several batches.
+        Poses in one batch; more poses are evaluated in several batches.
     deadline_s
-        Of one alignment, seconds: no evaluation begins after it, and a device that has not answered then is
-        not waited for; `None`: none.
+        Time of one alignment, seconds: no evaluation begins later, and waiting for a device ends then.
+        `None`: no deadline.
     """
 
     source_points: int = 131_072
@@ -64,13 +64,13 @@ class Limits:
 
     @property
     def max_map_bytes(self) -> int:
-        """The limit ``map_bytes``, or what stands for it."""
+        """The limit ``map_bytes``, or its default."""
         return VOXEL_BYTES * self.voxels if self.map_bytes is None else self.map_bytes
 
 
 @dataclass(frozen=True, slots=True)
 class Cut:
-    """What the limits left out of one alignment.
+    """Items that the limits left out of one alignment.
 
     Attributes
     ----------
@@ -79,9 +79,9 @@ class Cut:
     neighbor_points, neighbors
         In the last evaluation: points with more neighbours than the limit, and those neighbours.
     voxels, map_bytes
-        Gaussians of cells that were left out of the map, and what those would have taken.
+        Gaussians of cells left out of the map, and their size.
     deadline
-        Whether time was up before the alignment had ended.
+        Whether the deadline passed before the alignment ended.
     """
 
     points: int = 0
@@ -93,7 +93,7 @@ class Cut:
 
     @property
     def by(self) -> tuple[str, ...]:
-        """Names of the limits that left something out; a cell left out counts for both of its limits."""
+        """Names of the limits that left something out; an omitted cell counts for both of its limits."""
         left = {
             "points": self.points,
             "neighbors": self.neighbor_points,
@@ -109,19 +109,19 @@ class Cut:
 
 @dataclass(frozen=True, slots=True)
 class TimeBound:
-    """A bound of the time of one alignment on this machine.
+    """Upper bound of the time of one alignment on this machine.
 
     Attributes
     ----------
     evaluations
-        Passes over the scan, at most.
+        Largest number of passes over the scan.
     points
-        Of a scan, at most.
+        Largest number of points of a scan.
     point_ns
-        Time of one point in one pass, measured on the given scan, scaled up to as many neighbours as the
-        limit allows: processor time where this thread computes, else, on a device, time that passes.
+        Time of one point in one pass, measured on the given scan, scaled to the largest allowed number of
+        neighbours.  Processor time if this thread computes, wall-clock time on a device.
     deadline_s
-        The limit on one alignment's time; None: none.
+        The limit on one alignment's time; None: no limit.
     """
 
     evaluations: int
@@ -136,13 +136,13 @@ class TimeBound:
 
     @property
     def total_ms(self) -> float:
-        """The bound, milliseconds on one thread that has a processor for itself, or on the device."""
+        """The bound, milliseconds, for one thread with its own processor, or for the device."""
         most = self.evaluations * self.pass_ms
-        # a pass that has begun before the deadline is finished
+        # a pass that begins before the deadline runs to its end
         return most if self.deadline_s is None else min(most, self.deadline_s * 1e3 + self.pass_ms)
 
     def describe(self) -> str:
-        """Return the bound with what it is made of."""
+        """Return the bound with its factors, as text."""
         return (
             f"worst case for the largest scan allowed: {self.total_ms / 1e3:.1f} s"
             f" ({self.points} points x {self.evaluations} evaluations x {self.point_ns:.0f} ns"
@@ -153,34 +153,34 @@ class TimeBound:
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """How to align; what is None is the variant's own default.
+    """Method of alignments; None means the variant's default.
 
     Attributes
     ----------
     variant
-        ``"autoware"``, ``"pclomp"`` or ``"pcl"``: covariances, stop rule and neighbours of that program.
+        ``"autoware"``, ``"pclomp"`` or ``"pcl"``: covariances, stop rule and neighbours of this program.
     neighbors
         ``"direct1"``, ``"direct7"`` or ``"radius"`` (all voxels whose mean is within one leaf).
     epsilon
-        Steps below this end the alignment; metres and radians, and square metres for ``pcl``.
+        A step below this ends the alignment; metres and radians, for ``pcl`` square metres.
     max_iterations
     step_size
         Longest step, metres and radians.
     line_search
-        More-Thuente's line search.
+        Whether to use More-Thuente's line search.
     mode
-        ``"coarse_fine"``: when the variant's alignment has ended, continue from there with the voxels' true
-        covariances: the wide basin of the one and the accuracy of the other.
+        ``"coarse_fine"``: after the variant's alignment, continue with the voxels' true covariances.  This
+        combines a wide basin of convergence with accuracy.
     fine_epsilon
-        Where the fine part stops.
+        As ``epsilon``, for the fine stage.
     steady
-        Steps that never swing, see `StepRule`; default: not in ``"single"``, which equals the originals.
+        Whether to prevent oscillation, see `StepRule`; by default off in ``"single"``, as in the originals.
     backend
-        What computes: ``"numba"``, ``"numpy"`` or ``"opencl"``.
+        Backend that computes: ``"numba"``, ``"numpy"`` or ``"opencl"``.
     device
-        For backends that compute on a device: which one, and how.
+        Options of backends that compute on a device.
     fallback
-        Backend that goes on where a device fails in the middle of the work; None: that is an error.
+        Backend that takes over if a device fails during an alignment; None: raise the error.
     """
 
     variant: str = "autoware"
@@ -198,7 +198,7 @@ class Settings:
 
 
 def rule_of(settings: Settings, variant: Variant, limits: Limits) -> StepRule:
-    """Return the rule of an alignment's steps; `BadRequest` where a setting makes no sense."""
+    """Return the step rule of an alignment; raise `BadRequest` if a setting is invalid."""
     epsilon = variant.epsilon if settings.epsilon is None else settings.epsilon
     iterations = variant.max_iterations if settings.max_iterations is None else settings.max_iterations
     if not epsilon > 0 or not settings.step_size > 0 or not settings.fine_epsilon > 0 or iterations < 1:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""OpenCL devices of this machine: which there are, what they can do, which one is taken, how to wait for it.
+"""OpenCL devices of this machine: their list, their features, the choice of one, and waiting for it.
 
-OpenCL finds drivers by files in /etc/OpenCL/vendors: each of them names a driver's library.  Containers with
-NVIDIA's driver often have the library, but not its file.  Then this process uses a folder of its own, with
-copies of all these files and one for NVIDIA's library.
+OpenCL finds drivers by files in /etc/OpenCL/vendors, each of which names a driver's library.  Containers with
+NVIDIA's driver often have the library without its file.  Then this process uses its own folder, with copies
+of all these files and an additional one for NVIDIA's library.
 """
 
 from __future__ import annotations
@@ -52,31 +52,31 @@ _FOLDERS: Final = tuple(
         "/usr/local/cuda/compat",
     )
 )
-TIMEOUT_S: Final = 10.0  # for any command, where no deadline is nearer
+TIMEOUT_S: Final = 10.0  # for any command without an earlier deadline
 _NAP_S: Final = 20e-6
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceInfo:
-    """What a device says about itself.
+    """Properties that a device reports.
 
     Attributes
     ----------
     index
-        By which it can be chosen.
+        Index by which the device can be chosen.
     name, platform, driver
     kind
         ``"GPU"``, ``"accelerator"``, ``"CPU"`` or ``"other"``.
     fp64
-        Whether it has double precision.
+        Whether the device supports double precision.
     memory_bytes, max_bytes
-        Its memory, and the most that one buffer may have.
+        Memory of the device, and the largest size of one buffer.
     unified
-        Whether that is the processor's memory, too.
+        Whether the device shares the processor's memory.
     svm_system
-        Whether it reads all memory of the process (``CL_DEVICE_SVM_FINE_GRAIN_SYSTEM``).
+        Whether the device reads all memory of the process (``CL_DEVICE_SVM_FINE_GRAIN_SYSTEM``).
     unusable
-        Why it cannot be used; empty if it can.
+        Why the device cannot be used; empty if it can.
     """
 
     index: int
@@ -92,7 +92,7 @@ class DeviceInfo:
     unusable: str
 
     def describe(self) -> str:
-        """Return one line for people."""
+        """Return a one-line description for users."""
         able = [
             self.kind,
             f"driver {self.platform} {self.driver}",
@@ -105,7 +105,7 @@ class DeviceInfo:
 
 @dataclass(frozen=True, slots=True)
 class Device:
-    """A device that was chosen, ready to use.
+    """A chosen device, ready to use.
 
     Attributes
     ----------
@@ -113,9 +113,9 @@ class Device:
     handle
         The ``pyopencl.Device``.
     double
-        Whether it computes in double precision.
+        Whether the device computes in double precision.
     in_place
-        Whether it reads the map's segments where they lie.
+        Whether the device reads the map's segments in place.
     """
 
     info: DeviceInfo
@@ -125,7 +125,7 @@ class Device:
 
     @property
     def is_processor(self) -> bool:
-        """Whether its work-items are a processor's threads."""
+        """Whether work-items of the device are threads of a processor."""
         return self.info.kind == "CPU"
 
 
@@ -141,12 +141,12 @@ def list_devices() -> list[DeviceInfo]:
 
 
 def choose_device(options: DeviceOptions) -> Device:
-    """Return the device that is asked for; never another one.
+    """Return the requested device, never another one.
 
     Raises
     ------
     NoDevice
-        There is none, or it cannot do what is asked.
+        There is no such device, or it lacks a required feature.
     ModuleNotFoundError
         pyopencl is not installed.
     """
@@ -166,9 +166,9 @@ def choose_device(options: DeviceOptions) -> Device:
         )
     double = info.fp64 if options.precision == "auto" else options.precision == "double"
     if options.memory == "svm" and not double:
-        # A device without doubles has no instruction that reads them.  One that has them, and is set to use
-        # floats because its doubles are slow, would have to subtract and convert nine doubles for each
-        # neighbour at each evaluation, at the slow rate and with twice the bytes read; copying does it once.
+        # A device without doubles cannot read them.  A device whose doubles are slow, and which is set to
+        # floats, would subtract and convert nine doubles for each neighbour at each evaluation, at the slow
+        # rate and with twice the bytes read.  Copying the map converts them once.
         raise NoDevice(
             "segments have double precision: a program that computes with floats cannot read them in place",
             hint="--memory copy, or --precision double",
@@ -193,7 +193,7 @@ def _first_preferred(found: list[tuple[DeviceInfo, Any]]) -> tuple[DeviceInfo, A
 def _found() -> list[tuple[DeviceInfo, Any]]:
     os.environ.setdefault(
         "PYOPENCL_NO_CACHE", "1"
-    )  # a cache of its own, which fails where it cannot be written
+    )  # pyopencl's own cache fails where its folder is not writable
     _make_drivers_known()
     import pyopencl as cl
 
@@ -215,7 +215,7 @@ def _info(cl: Any, index: int, platform: Any, handle: Any) -> DeviceInfo:
     def asked(name: str, default: Any) -> Any:
         try:
             return getattr(handle, name)
-        except cl.Error:  # an older driver does not know the question
+        except cl.Error:  # an older driver does not support this query
             return default
 
     kinds = {
@@ -248,14 +248,14 @@ def _info(cl: Any, index: int, platform: Any, handle: Any) -> DeviceInfo:
 
 
 def vendors_with_nvidia(vendors: Path, folders: Iterable[Path]) -> Path | None:
-    """Return a new folder of vendors' files that names NVIDIA's driver, too; None where none is needed.
+    """Return a new folder of vendors' files that includes NVIDIA's driver; None where none is needed.
 
     Parameters
     ----------
     vendors
-        What the loader reads.
+        Folder that OpenCL's loader reads.
     folders
-        Where the driver's library may be.
+        Folders that may contain the driver's library.
     """
     named = sorted(vendors.glob("*.icd")) if vendors.is_dir() else []
     if any("nvidia" in file.read_text(encoding="utf-8", errors="replace") for file in named):
@@ -271,7 +271,7 @@ def vendors_with_nvidia(vendors: Path, folders: Iterable[Path]) -> Path | None:
 
 
 def _make_drivers_known() -> None:
-    """Let the loader find NVIDIA's driver; to be called before the loader is."""
+    """Make OpenCL's loader find NVIDIA's driver; call this before the first call of OpenCL."""
     if "OCL_ICD_VENDORS" in os.environ:
         return
     made = vendors_with_nvidia(_VENDORS, _FOLDERS)
@@ -283,13 +283,13 @@ def _make_drivers_known() -> None:
 class Waiting:
     """Waits for events of one device.
 
-    It sleeps for most of the time that the last wait took, then polls: a wait costs the
-    processor little, and ends microseconds after the event.
+    A wait sleeps for most of the time that the last wait took, then polls.  So it uses little processor
+    time, and ends microseconds after the event.
 
     Parameters
     ----------
     device
-        Its name, for errors.
+        Name of the device, for errors.
     """
 
     def __init__(self, device: str) -> None:
@@ -302,16 +302,16 @@ class Waiting:
         Parameters
         ----------
         event
-            Of the command; its queue has been flushed.
+            Event of the command, whose queue has been flushed.
         deadline_s
-            Of `time.monotonic`; None: `TIMEOUT_S` from now.
+            Deadline on `time.monotonic`; None: `TIMEOUT_S` from now.
 
         Raises
         ------
         DeviceHung
-            It has not ended then.
+            The command has not ended at the deadline.
         DeviceError
-            It failed.
+            The command failed.
         """
         began_s = time.monotonic()
         latest_s = began_s + TIMEOUT_S
@@ -339,5 +339,5 @@ def _ended(event: Any) -> bool:
 
 
 def _never_free(event: Any) -> None:
-    """Keep an event for good: freeing it would wait for a hung device, even when the process ends."""
+    """Keep an event until the process ends: freeing it would wait for a hung device, even at exit."""
     ctypes.pythonapi.Py_IncRef(ctypes.py_object(event))

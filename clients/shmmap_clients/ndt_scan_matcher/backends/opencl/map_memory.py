@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where maps lie for a device: read in place, or copied to one of two buffers that take turns.
+"""Memory of maps for a device: read in place, or copied to one of two alternating buffers.
 
-A map *in place* needs a device that can read any address of the process (shared virtual memory of fine grain,
-system-wide).  Nothing is written to it, and nothing is held twice: the table of cells is the one that the
-compiled backend uses.
+A map *in place* requires a device that can read any address of the process (fine-grained system SVM).
+Nothing is copied to the device: the kernel uses the same table of cells as the compiled backend.
 
-Else there are two buffers of fixed size.  One holds the map in use; the next map is written to the other one
-beside it.  No map takes memory that was not there from the beginning.
+Other devices have two buffers of fixed size.  One holds the map in use, and the next map is written to the
+other one meanwhile.  No memory is allocated later.
 """
 
 from __future__ import annotations
@@ -39,16 +38,16 @@ class PlacedMap:
     Attributes
     ----------
     buffer
-        That the kernel gets.
+        Buffer passed to the kernel.
     places
-        Of the table of cells, their origins, where each square's cells start, and the cells: offsets into the
-        buffer, or addresses where maps are read in place.
+        Positions of four arrays: table of cells, their origins, start of each square's cells, and those
+        cells.  Offsets into the buffer, or addresses where maps are read in place.
     lead
         Columns of the lattice between the first square's corner and the map's box, in i and j.
     squares
-        In a row of j.
+        Number of squares in a row along j.
     memory
-        What lies at the addresses, where nothing else keeps it.
+        Objects that own the memory at these addresses, unless something else keeps it.
     """
 
     buffer: Any
@@ -64,7 +63,7 @@ class MapInPlace:
     Parameters
     ----------
     context
-        Of the device.
+        Context of the device.
     """
 
     used_bytes = 0  # on the device
@@ -73,7 +72,7 @@ class MapInPlace:
         import pyopencl as cl
 
         self.statistics = UploadStatistics()
-        # the kernel takes a buffer, and does not look at it
+        # the kernel requires a buffer argument, but does not read it
         self._buffer = cl.Buffer(context, cl.mem_flags.READ_ONLY, 64)
         self._placed: dict[tuple[int, Covariance], tuple[VoxelMap, PlacedMap]] = {}
         self._current: VoxelMap | None = None
@@ -85,11 +84,11 @@ class MapInPlace:
         self._buffer.release()
 
     def prepare(self, voxel_map: VoxelMap, covariance: Covariance) -> None:
-        """Make the tables of the next map; those of the map in use stay."""
+        """Build the tables of the next map; keep those of the map in use."""
         self._make(voxel_map, covariance)
 
     def use(self, voxel_map: VoxelMap, covariance: Covariance) -> PlacedMap:
-        """Return where a map lies; the one that was used before may be forgotten from now on."""
+        """Return the placement of a map; the map used before may be dropped from now on."""
         self._current = voxel_map
         known = self._placed.get((id(voxel_map), covariance))
         return self._make(voxel_map, covariance) if known is None else known[1]
@@ -109,35 +108,35 @@ class MapInPlace:
 
 
 class _Half:
-    """One of the two buffers, and the map that lies there."""
+    """One of the two buffers, with the map in it."""
 
     def __init__(self, buffer: Any) -> None:
         self.buffer = buffer
         self.empty()
 
     def empty(self) -> None:
-        """Give the map up."""
+        """Release the map."""
         self.map: VoxelMap | None = None
         self.used_bytes = 0
-        self.cells: NDArray[np.int64] = np.empty((2, 0), np.int64)  # where lattices and means lie
+        self.cells: NDArray[np.int64] = np.empty((2, 0), np.int64)  # offsets of lattices and means
         self.placed: dict[Covariance, PlacedMap] = {}
 
 
 class MapBuffers:
-    """Memory of one device for two maps; `prepare` may be called beside the thread that matches.
+    """Memory of one device for two maps; another thread may call `prepare` during matching.
 
     Parameters
     ----------
     context
-        Of the device.
+        Context of the device.
     device
     map_bytes
-        Of each of the two buffers.
+        Size of each of the two buffers.
 
     Raises
     ------
     DeviceMemory
-        The device has not as much.
+        The device has less memory.
     """
 
     def __init__(self, context: Any, device: Device, map_bytes: int) -> None:
@@ -152,7 +151,7 @@ class MapBuffers:
         with device_errors(device.info.name, f"allocate twice {map_bytes / 1e6:.0f} MB for maps"):
             flags = cl.mem_flags
             if device.is_processor:
-                # it reads this process's memory: how that is paged is ours to choose
+                # the device reads this process's memory, so this process chooses the page size
                 halves = [
                     cl.Buffer(
                         context, flags.READ_ONLY | flags.USE_HOST_PTR, hostbuf=in_large_pages(map_bytes)
@@ -161,7 +160,7 @@ class MapBuffers:
                 ]
             else:
                 halves = [cl.Buffer(context, flags.READ_ONLY, map_bytes) for _ in range(2)]
-            # a queue of its own: no evaluation waits for a map that is being written
+            # separate queue: no evaluation waits while a map is being written
             self._queue = cl.CommandQueue(context, device.handle)
         self._current, self._spare = map(_Half, halves)
 
@@ -171,12 +170,12 @@ class MapBuffers:
         return self._current.used_bytes + self._spare.used_bytes
 
     def close(self) -> None:
-        """Give the device's memory back."""
+        """Release the device's memory."""
         self._current.buffer.release()
         self._spare.buffer.release()
 
     def prepare(self, voxel_map: VoxelMap, covariance: Covariance) -> None:
-        """Write a map beside the one in use; where it does not fit, `use` raises.
+        """Write a map to the buffer that is not in use; if it does not fit, `use` raises.
 
         Raises
         ------
@@ -190,7 +189,7 @@ class MapBuffers:
             self._place(half, voxel_map, covariance)
 
     def use(self, voxel_map: VoxelMap, covariance: Covariance) -> PlacedMap:
-        """Return where a map lies; the one that was used before may be overwritten from now on.
+        """Return the placement of a map; the map used before may be overwritten from now on.
 
         Raises
         ------
@@ -208,7 +207,7 @@ class MapBuffers:
                 half.empty()
             fits = self._place(half, voxel_map, covariance)
             if not fits and half.placed:
-                # another kind of covariance has taken the room
+                # another kind of covariance occupies the space
                 half.empty()
                 self.statistics.laid_out_again += 1
                 fits = self._place(half, voxel_map, covariance)
@@ -221,7 +220,7 @@ class MapBuffers:
         return half.placed[covariance]
 
     def _place(self, half: _Half, voxel_map: VoxelMap, covariance: Covariance) -> bool:
-        """Write what a buffer has not yet of a map; False, and nothing has changed, where it has no room."""
+        """Write the missing parts of a map to a buffer; return False, with no change, if they do not fit."""
         if covariance in half.placed:
             return True
         real, cells = self._real, voxel_map.cells
@@ -256,18 +255,18 @@ class MapBuffers:
     def _means(self, cell: VoxelCell) -> NDArray[np.float64]:
         if self._device.double:
             return cell.mean
-        # relative to the lattice's corner, which is exact where the kernel computes it
+        # relative to the lattice's corner, which the kernel computes exactly
         return cell.mean + (cell.origin - cell.lattice_origin * cell.leaf)
 
     def _write(
         self, buffer: Any, first: int, end: int, offsets: Sequence[int], arrays: Sequence[NDArray[Any]]
     ) -> None:
-        """Write arrays to their offsets, all between two bytes of a buffer."""
+        """Write arrays to their offsets, all within one range of a buffer."""
         import pyopencl as cl
 
         queue = self._queue
         with device_errors(self._device.info.name, "write a map"):
-            there: Any  # an array whose base is to be released
+            there: Any  # mapped array; its base must be released
             there, mapped = cl.enqueue_map_buffer(
                 queue,
                 buffer,
@@ -292,26 +291,26 @@ class MapBuffers:
 
 
 def in_large_pages(nbytes: int) -> NDArray[np.uint8]:
-    """Return memory that begins with a large page; none of it is there before it is touched.
+    """Return memory aligned to a large page; the kernel allocates pages at first access.
 
-    A map of 5 MB costs 1300 page faults the first time it is written to memory in pages of 4 KiB, 3 to 20 ms;
-    in pages of 2 MiB three of them.
+    The first write of a 5 MB map causes 1300 page faults with pages of 4 KiB, which take 3 to 20 ms, but
+    only three with pages of 2 MiB.
 
     Parameters
     ----------
     nbytes
-        How many bytes.
+        Size in bytes.
 
     Raises
     ------
     MemoryError
-        The machine has not as much.
+        The machine has less memory.
     """
     try:
         memory = mmap.mmap(-1, nbytes + _LARGE_PAGE, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
     except OSError as error:
         raise MemoryError(f"{nbytes} bytes: {error.strerror}") from None
-    with contextlib.suppress(OSError):  # a kernel without them: ordinary pages
+    with contextlib.suppress(OSError):  # a kernel without large pages: ordinary ones
         memory.madvise(mmap.MADV_HUGEPAGE)
     whole = np.frombuffer(memory, np.uint8)
     first = -whole.ctypes.data % _LARGE_PAGE
@@ -321,14 +320,14 @@ def in_large_pages(nbytes: int) -> NDArray[np.uint8]:
 def _tables(voxel_map: VoxelMap, table: NDArray[np.int64]) -> tuple[list[NDArray[Any]], tuple[int, int], int]:
     """Return the arrays of `PlacedMap.places` in their order, its ``lead`` and its ``squares``.
 
-    The directory has a place for each square of 8 x 8 columns instead of one for each column: what is written
-    for every map is small.  The kernel tests whether a cell really has the column.
+    The directory has an entry for each square of 8 x 8 columns instead of each column, so that little is
+    written per map.  The kernel tests whether a cell really contains the column.
 
     Parameters
     ----------
     voxel_map
     table : (C, `TABLE_COLUMNS`) int64
-        Of its cells; what is in the columns of addresses does not matter here.
+        Table of the map's cells; the columns with addresses are ignored here.
     """
     first, shape = voxel_map.boxes[:, :2], voxel_map.boxes[:, 8:]
     low, squares = np.zeros(2, np.int64), 1
@@ -339,7 +338,7 @@ def _tables(voxel_map: VoxelMap, table: NDArray[np.int64]) -> tuple[list[NDArray
         end = ((first[has] + shape[has] - 1) >> _SQUARE_SHIFT) + 1
         low, high = begin.min(axis=0), end.max(axis=0)
         rows, squares = (high - low).tolist()
-        # every cell with every square from its first to its last
+        # pair every cell with each square from its first to its last
         across, along = (end - begin).T
         number = across * along
         cell = np.repeat(np.arange(len(has)), number)
