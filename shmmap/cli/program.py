@@ -93,7 +93,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def join_negative_values(words: Sequence[str], options: Container[str] | None = None) -> list[str]:
-    """Write ``--circle -5,3,40`` as ``--circle=-5,3,40``, for ``options``; if there are none, for all options.
+    """Write ``--circle -5,3,40`` as ``--circle=-5,3,40``, for ``options``; if None, for all options.
 
     Otherwise argparse reads a word that starts with a minus as an option, unless the word is one number.
     """
