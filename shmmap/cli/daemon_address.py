@@ -72,11 +72,17 @@ def locate(args: argparse.Namespace) -> tuple[str, str]:
     ------
     NoSocket
         No daemon listens at the socket, and the instance of that name listens elsewhere.
+    ProtocolMismatch
+        The daemon at this socket is of another version, and no statistics name it.
     """
     named, by_name = _named_socket(args), (instance(args), shm_dir(args))
     if _is_at(*by_name, named if _endpoint_setting(args) or _setting(args, "runtime_dir") else ""):
         return by_name
-    found = _asked(args, named) if named else None
+    found, mismatch = None, None
+    try:
+        found = _asked(args, named) if named else None
+    except ProtocolMismatch as error:
+        mismatch = error
     if found is None and named:  # no reply, or no permission: look for statistics naming this socket
         places = dict.fromkeys((by_name[1], usual_directory("")))
         found = next(
