@@ -78,11 +78,11 @@ def locate(args: argparse.Namespace) -> tuple[str, str]:
     named, by_name = _named_socket(args), (instance(args), shm_dir(args))
     if _is_at(*by_name, named if _endpoint_setting(args) or _setting(args, "runtime_dir") else ""):
         return by_name
-    found, mismatch = None, None
+    mismatch: ProtocolMismatch | None = None
     try:
         found = _asked(args, named) if named else None
     except ProtocolMismatch as error:
-        mismatch = error
+        found, mismatch = None, error
     if found is None and named:  # no reply, or no permission: look for statistics naming this socket
         places = dict.fromkeys((by_name[1], usual_directory("")))
         found = next(

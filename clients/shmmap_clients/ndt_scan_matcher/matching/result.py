@@ -11,8 +11,8 @@ metres fit at many poses; limits on `Evidence` exclude such results.  The Hessia
 the information about the pose, up to a factor.  ``sharpness`` is the least curvature of the score when the
 scan is translated in any direction.  ``spread`` compares directions, with turns left free: the covariance of
 the position is the translational block of the inverse Hessian (the Schur complement of the rotations).  How
-round it is depends neither on the number of points nor on units.  Degeneracy by the smallest eigenvalue: Zhang,
-Kaess and Singh, "On degeneracy of optimization-based state estimation problems", ICRA 2016; translations and
+round it is depends neither on the number of points nor on units.  Degeneracy by the smallest eigenvalue:
+Zhang, Kaess and Singh, "On degeneracy of optimization-based state estimation problems", ICRA 2016; translations and
 rotations by themselves, for metres and radians do not compare: Tuna et al., "X-ICP", IEEE T-RO 2024.
 
 The limits were chosen on parts of recorded and simulated scans; ``python -m tests.benchmarks.ndt_trust``
