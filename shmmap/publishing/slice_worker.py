@@ -123,11 +123,11 @@ class PublishedPoints:
         return ()
 
     def named(self, message: str) -> str:
-        """Return the message as it is: it names cells by their ids."""
+        """Return the message unchanged, as it already names cells by their ids."""
         return message
 
     def explain(self, source: Source, message: str) -> str:
-        """Return the message as it is."""
+        """Return the message unchanged."""
         del source
         return message
 
