@@ -41,7 +41,7 @@ _BLOBS: Final = "blobs/"
 
 @dataclass(slots=True)
 class Pruned:
-    """Result of pruning: versions, objects, bytes and parts of slices that were removed, and those kept."""
+    """Result of pruning: removed versions, objects, bytes and parts of slices, and what was kept."""
 
     versions: list[int] = field(default_factory=list)
     objects: int = 0
