@@ -161,7 +161,7 @@ def derive(
     source
         The cell's points, if already in memory; None: the cell's file is read.
     reserve
-        Called with the segment's size in bytes before anything is written; it refuses by raising.
+        Called with the segment's size in bytes before anything is written; raises to refuse it.
 
     Raises
     ------
@@ -322,7 +322,7 @@ def make_layer(
     source
         Returns the cell's points if they are in memory, else None; called only for computed layers.
     reserve
-        Called with the segment's size in bytes before anything is written; it refuses by raising.
+        Called with the segment's size in bytes before anything is written; raises to refuse it.
 
     Raises
     ------

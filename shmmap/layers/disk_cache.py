@@ -143,7 +143,7 @@ class LayerCache:
         fd
             Empty file, open for writing; empty again if no entry is loaded.
         reserve
-            Called with the segment's size in bytes before anything is written; it refuses by raising.
+            Called with the segment's size in bytes before anything is written; raises to refuse it.
 
         Returns
         -------

@@ -47,7 +47,7 @@ def build_points(
     cell_id, box, frame_id
         Values for the segment's header; ``box`` is (min_x, min_y, max_x, max_y) in metres.
     reserve
-        Called with the segment's size in bytes before anything is allocated; it refuses by raising.
+        Called with the segment's size in bytes before anything is allocated; raises to refuse it.
     warn
         Called with a message for each oddity of the file.
 

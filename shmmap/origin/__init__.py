@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where cells come from: map directories, single clouds, published maps."""
+"""Origins of a map's cells: map directories, single clouds, published maps."""

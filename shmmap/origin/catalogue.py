@@ -106,7 +106,7 @@ class Catalogue:
         self.problems = tuple(problems)
         self.opened: OpenedDirectories | None = None
         self.frame: MapFrame = UNKNOWN_FRAME
-        """Where the map frame lies in the world, see `MapFrame`; the reader of the map sets it."""
+        """Transform from the map frame to the inputs' coordinates; set by the reader of the map."""
 
     def _refuse_bad(self, boxes: NDArray[np.float64]) -> None:
         bad = ~np.isfinite(boxes).all(axis=1) | (boxes[:, :2] > boxes[:, 2:]).any(axis=1)
@@ -157,7 +157,7 @@ class Catalogue:
 
     @property
     def bounds(self) -> tuple[float, float, float, float] | None:
-        """Box around all cells, metres, map frame; None where there are none."""
+        """Box around all cells, metres, map frame; None if there are no cells."""
         return self._index.made.bounds
 
     @property
@@ -187,17 +187,17 @@ class Catalogue:
         return sum(int(table.nbytes) for table in tables) + self._index.nbytes
 
     def id(self, index: int) -> str:
-        """Id of a cell: the absolute path of its file."""
+        """Return the id of a cell: the absolute path of its file."""
         return self._names.id(index)
 
     def ids(self, indices: Indices) -> list[str]:
-        """Ids of several cells, in the order given."""
+        """Return the ids of several cells, in the order given."""
         return self._names.ids(indices)
 
     def find(self, cell: str) -> int | None:
-        """Index of the cell with this id, in full or without `id_prefix`, or else with this base name.
+        """Return the index of the cell with this full id, id without `id_prefix`, or else base name.
 
-        None where there is no such cell.
+        None if no cell matches.
 
         Raises
         ------
@@ -207,17 +207,17 @@ class Catalogue:
         return self._names.find(cell)
 
     def box(self, index: int) -> tuple[float, float, float, float]:
-        """``min_x, min_y, max_x, max_y`` of a cell, metres, map frame."""
+        """Return ``min_x, min_y, max_x, max_y`` of a cell, metres, map frame."""
         min_x, min_y, max_x, max_y = self.boxes[index].tolist()
         return min_x, min_y, max_x, max_y
 
     def boxes_of(self, indices: Indices) -> NDArray[np.float64]:
-        """(K, 4) float64, boxes of these cells, as `box`."""
+        """Return the boxes of cells, (K, 4) float64, each as in `box`."""
         boxes: NDArray[np.float64] = self.boxes[indices]
         return boxes
 
     def source(self, index: int) -> Source:
-        """Source of a cell's points: the file whose path is the cell's id."""
+        """Return the source of a cell's points: the file whose path is the cell's id."""
         return Source(self.id(index))
 
     def ready(self, index: int, layer: str) -> None:
@@ -225,11 +225,11 @@ class Catalogue:
         del index, layer
 
     def stamp(self, index: int) -> Stamp:
-        """Last known stamp of a cell's file."""
+        """Return the last known stamp of a cell's file."""
         return bytes(self._stamps[index].astype("<i8", copy=False).tobytes())
 
     def source_bytes(self, index: int) -> int:
-        """Last known size of a cell's file in bytes."""
+        """Return the last known size of a cell's file in bytes."""
         return int(self._stamps[index, 0])
 
     def set_stamp(self, index: int, stamp: Stamp) -> None:
@@ -242,7 +242,7 @@ class Catalogue:
         self._map_version = None
 
     def version(self, index: int) -> int:
-        """64-bit version of a cell, see `shmmap.segment.version.cell_version`."""
+        """Return the 64-bit version of a cell, see `shmmap.segment.version.cell_version`."""
         version = int(self._versions[index])
         if not version:
             version = cell_version(self.id(index), self.stamp(index), self.box(index))
@@ -305,7 +305,7 @@ class Catalogue:
 
 
 class MapOrigin(Protocol):
-    """Where the cells of one map come from.
+    """Source of one map's catalogue.
 
     A loader reads each cell.  It raises `Offline` if the source cannot be reached at present: the cell stays
     ``offline`` until the next attempt.

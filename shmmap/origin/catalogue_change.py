@@ -23,7 +23,7 @@ class CellIds(Protocol):
     """Cells whose ids are found by index."""
 
     def ids(self, indices: Indices) -> list[str]:
-        """Ids of several cells, in the order given."""
+        """Return the ids of several cells, in the order given."""
 
 
 class Tables(CellIds, Protocol):

@@ -53,16 +53,16 @@ class CellNames:
         return len(self.names)
 
     def id(self, index: int) -> str:
-        """Full id of one cell."""
+        """Return the full id of one cell."""
         return self.prefix + os.fsdecode(bytes(self.names[index]))
 
     def ids(self, indices: NDArray[np.intp]) -> list[str]:
-        """Full ids of several cells, in the order given."""
+        """Return the full ids of several cells, in the order given."""
         prefix = self.prefix
         return [prefix + os.fsdecode(name) for name in self.names[indices].tolist()]
 
     def find(self, wanted: str) -> int | None:
-        """Index of the cell with this id, in full or without the prefix, or with this base name.
+        """Return the index of the cell with this full id, id without the prefix, or base name.
 
         A base name must be unique.  Exception: a cell directly below the prefix is found by its base name in
         any case, because that is its id without the prefix.

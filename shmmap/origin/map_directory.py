@@ -67,7 +67,7 @@ def open_map(
         Behave like Autoware's loader: integer corners only, no unknown keys, an entry without its
         file is an error, directories are not searched recursively.
     cache_dir
-        Where the catalogue of a large map is cached; default `default_cache_directory()`.
+        Directory that caches the catalogues of large maps; default `default_cache_directory()`.
 
     Raises
     ------

@@ -447,7 +447,7 @@ class _EventReader:
 
 
 def _line_offset(data: bytes, line: int) -> int:
-    """Byte offset at which the 0-based ``line`` starts."""
+    """Return the byte offset at which the 0-based ``line`` starts."""
     offset = 0
     for _ in range(line):
         offset = data.find(b"\n", offset) + 1

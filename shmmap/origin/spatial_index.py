@@ -176,7 +176,7 @@ class MadeOfBoxes(NamedTuple):
     grids
         Empty if there are few cells.
     bounds
-        Box around all boxes, metres, map frame; None where there are none.
+        Box around all boxes, metres, map frame; None if there are no boxes.
     mean_size
         Mean extent of the boxes along x and y, metres.
     """

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Computing a map's layers ahead of time, into the disk cache that the daemon reads."""
+"""Computes a map's layers ahead of time, into the disk cache that the daemon reads."""

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Preparing a whole map: every cell to a worker, on all cores, until nothing is missing.
+"""Prepares a whole map: worker processes on all cores compute the layers of every cell.
 
-Stopped at any moment and started again, the run continues where it was: what is in the cache is only
-looked at.
+A run may be stopped at any moment.  The next run continues there: it only checks the layers that are in the
+cache already.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ __all__ = ["Failure", "PrepareProgress", "Prepared", "prepare_map", "task_of"]
 
 
 class PrepareProgress(Protocol):
-    """How far a run is."""
+    """Receives the progress of a run."""
 
     def stage(self, name: str, total: int) -> None:
         """Begin a stage of ``total`` cells."""
 
     def advance(self, cells: int) -> None:
-        """More cells are done."""
+        """Add ``cells`` to the number of finished cells."""
 
     def done(self, cells: int) -> None:
-        """Everything is done."""
+        """Report that all cells are done."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ class Failure:
 
 @dataclass(slots=True)
 class Prepared:
-    """What a run came to; layers are counted by how they got there, ``bytes`` are those of all of them."""
+    """Result of a run: layers counted by how they got into the cache; ``bytes`` is their total size."""
 
     cells: int
     kept: int = 0
@@ -57,7 +57,7 @@ class Prepared:
 
 
 class _Count:
-    """Adds up what workers report."""
+    """Adds up the workers' reports."""
 
     def __init__(self, total: int, progress: PrepareProgress) -> None:
         self._progress = progress
@@ -89,23 +89,23 @@ def prepare_map(
     workers: int,
     progress: PrepareProgress,
 ) -> Prepared:
-    """Bring layers of every cell of a map into the disk cache.
+    """Compute layers of every cell of a map into the disk cache.
 
     Parameters
     ----------
     layers
-        Specs, in any form.
+        Specs of the layers, in any form.
     cache_dir, cache_bytes
-        Where, and at most how much; what was used least recently makes room.
+        Directory of the cache, and its size limit; the least recently used entries are evicted.
     workers
-        How many processes.
+        Number of worker processes.
 
     Raises
     ------
     BadRequest
-        If a layer is unknown.
+        A layer is unknown.
     CannotWrite
-        If nothing can be kept in ``cache_dir``.
+        ``cache_dir`` cannot be written.
     """
     names = canonical_layers(layers)
     cache = LayerCache(cache_dir, limit_bytes=cache_bytes)
@@ -139,7 +139,7 @@ def prepare_map(
 def task_of(
     catalogue: Catalogue, versions: LayerVersions, index: int, layers: Sequence[str]
 ) -> tuple[CellTask, list[Failure]]:
-    """Return the task of making layers of a cell, without those that would look into too many cells."""
+    """Return the task for a cell's layers, and failures for layers that would use too many neighbours."""
     around: dict[str, tuple[Neighbour, ...]] = {}
     crowded: list[Failure] = []
     for layer in layers:

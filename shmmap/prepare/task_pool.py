@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tasks about cells, worked off by processes: a hostile file costs its cell, not the run.
+"""Runs tasks on cells in worker processes, so that a hostile file fails only its cell, not the run.
 
-Workers are processes that the kernel ends with this one.  One that dies costs the task it worked on; another
-takes its place.  One packet is one message.  Publishing gives its workers the same tasks.
+The kernel ends the workers with this process.  If a worker dies, only its current task fails, and another
+worker replaces it.  Each packet is one message.  Publishing uses the same tasks.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ __all__ = [
 
 
 class CellTask(msgspec.Struct, array_like=True, tag="cell"):
-    """Make these layers of a cell; ``around`` are, for each layer, the cells it looks into."""
+    """Task to make layers of a cell; ``around`` lists, for each layer, the neighbours it uses."""
 
     number: int
     cell_id: str
@@ -48,7 +48,7 @@ class CellTask(msgspec.Struct, array_like=True, tag="cell"):
 
 
 class LayerDone(msgspec.Struct, array_like=True):
-    """One layer: ``how`` is kept (it was there), recognised, built or failed."""
+    """Result for one layer: ``how`` is kept (it was in the cache), recognised, built or failed."""
 
     layer: str
     how: str
@@ -57,14 +57,14 @@ class LayerDone(msgspec.Struct, array_like=True):
 
 
 class CellDone(msgspec.Struct, array_like=True, tag="done"):
-    """A cell is done, layer by layer."""
+    """Message that a cell is done, with a result for each layer."""
 
     number: int
     layers: tuple[LayerDone, ...]
 
 
 class Ready(msgspec.Struct, array_like=True, tag="ready"):
-    """The worker has started."""
+    """Message that a worker has started."""
 
 
 FromWorker: TypeAlias = CellDone | Ready
@@ -73,9 +73,9 @@ encode: Final = msgspec.msgpack.Encoder().encode
 _task: Final[msgspec.msgpack.Decoder[CellTask]] = msgspec.msgpack.Decoder(CellTask)
 _done: Final[msgspec.msgpack.Decoder[FromWorker]] = msgspec.msgpack.Decoder(FromWorker)
 decode_task: Final = _task.decode
-"""Reads a message for a worker."""
+"""Decodes a message to a worker."""
 decode_done: Final = _done.decode
-"""Reads a worker's message."""
+"""Decodes a message from a worker."""
 
 
 _FAILED_STARTS: Final = 3
@@ -98,22 +98,22 @@ class _Worker(Generic[_Task]):
 
 
 class TaskPool(Generic[_Task, _Done]):
-    """Runs tasks in processes, each with a number of its own.
+    """Runs tasks in worker processes; each task has a unique number.
 
     Parameters
     ----------
     module, arguments
-        What a worker runs, see `start_child`.  It sends `Ready`, then one message for each task.
+        Module that a worker runs, see `start_child`.  It sends `Ready`, then one message for each task.
     workers
-        How many processes, at most.
+        Maximum number of processes.
     decode
-        Reads a worker's message.
+        Decodes a worker's message.
     finished
-        Called with each task's message.
+        Called with each task and its message.
     died
-        Called with a task that a worker died of, and how.
+        Called with a task whose worker crashed, and a description of the crash.
     ahead
-        Tasks that a worker has at a time, so that it need not wait for the next one.
+        Number of tasks assigned to a worker at a time, so that it need not wait for the next one.
     """
 
     def __init__(
@@ -141,7 +141,7 @@ class TaskPool(Generic[_Task, _Done]):
         self._failed_starts = 0
 
     def run(self, tasks: Iterator[_Task]) -> None:
-        """Work off all tasks.
+        """Run all tasks.
 
         Raises
         ------
@@ -163,7 +163,7 @@ class TaskPool(Generic[_Task, _Done]):
             self._selector.close()
 
     def _next(self) -> _Task | None:
-        """Return the next task: one given back, or a new one."""
+        """Return the next task: one returned by a dead worker, or a new one; None if there is none."""
         return self._again.pop() if self._again else next(self._tasks, None)
 
     def _start(self, task: _Task) -> None:
@@ -175,7 +175,7 @@ class TaskPool(Generic[_Task, _Done]):
 
     def _give(self, worker: _Worker[_Task], task: _Task) -> None:
         worker.tasks[task.number] = task
-        with contextlib.suppress(OSError):  # its end is reported by its channel
+        with contextlib.suppress(OSError):  # the channel reports a dead worker
             worker.channel.send(encode(task))
 
     def _fill(self, worker: _Worker[_Task]) -> None:
@@ -206,7 +206,7 @@ class TaskPool(Generic[_Task, _Done]):
             if self._failed_starts >= _FAILED_STARTS:
                 raise InternalError(f"no worker can be started: {how}")
             self._again += tasks
-        elif len(tasks) > 1:  # one of them: found by giving each to a worker that has no other
+        elif len(tasks) > 1:  # the culprit is found by giving each task alone to a worker
             self._ahead = 1
             self._again += tasks
         else:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A preparing worker: a process of its own that builds the layers of one cell after the other.
+"""Preparing worker: a process that builds the layers of one cell after the other.
 
-A file that crashes it costs that one cell; it dies with the process that started it.
+A file that crashes the worker fails only its own cell.  The worker ends with the process that started it.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ _BLOCK_BYTES: Final = 1 << 20
 
 
 def _prepare_cell(task: CellTask, cache: LayerCache, *, recognise: bool) -> CellDone:
-    """Bring every layer of a cell into the cache; the file is read once for all computed layers.
+    """Compute every layer of a cell into the cache; the file is read once for all computed layers.
 
-    ``recognise``: look in the cache for layers of other states of the same files.
+    ``recognise``: search the cache for layers of the same content under other versions.
     """
     done: dict[str, LayerDone] = {}
     missing: list[tuple[LayerSpec, CellJob, CacheKey]] = []
@@ -61,7 +61,7 @@ def _prepare_cell(task: CellTask, cache: LayerCache, *, recognise: bool) -> Cell
 
 
 class CellPoints:
-    """The cell's points, read when first asked for, with the columns that all layers need together."""
+    """A cell's points, read at the first use, with all columns that any of the layers needs."""
 
     def __init__(
         self, source: Source, box: Box, specs: list[LayerSpec], reader: SourceReader = FILES
@@ -76,7 +76,7 @@ class CellPoints:
         )
 
     def points(self, spec: LayerSpec) -> CellSource:
-        """Return the columns that one layer takes: exactly those, whatever the others need."""
+        """Return the cell's points with exactly the columns that one layer uses."""
         if self._read is None:
             self._read = self._reader.read(self._source, self._box, self._needs)
         names = spec.source_columns
@@ -104,13 +104,13 @@ def _build(spec: LayerSpec, job: CellJob, cache: LayerCache, source: CellPoints)
         message = f"{error.filename or job.source.name}: {error.strerror or error}"
     except MemoryError:
         message = f"{job.source.name}: building {name} ran out of memory"
-    except Exception as error:  # noqa: BLE001  a builder of another package, say: it costs one layer
+    except Exception as error:  # noqa: BLE001  e.g. in another package's builder: only this layer fails
         message = f"{job.source.name}: building {name} failed: {error!r}"
     return LayerDone(name, "failed", 0, message[:2000])
 
 
 def _content(job: CellJob, known: dict[str, bytes]) -> bytes:
-    """Digest of the files that a layer is computed from, each read once; zeros where one cannot be."""
+    """Return the digest of a layer's input files, each read once; an unreadable file counts as zeros."""
     around = [near.source.name for near in job.neighbours]
     for path in (job.source.name, *around):
         if path not in known:

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Publishing a map into a bucket or a directory, its versions there, and fetching it back."""
+"""Publishes a map into a bucket or a directory, manages its versions there, and fetches it back."""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A published map back into files: a divided map, as Autoware reads it, every object verified on the way.
+"""Fetches a published map into files: a divided map in Autoware's format, with every object verified.
 
-The directory appears complete or not at all.  What a run that was stopped has fetched is not fetched again.
+The directory appears complete or not at all.  A run after an interrupted one does not fetch its cells again.
 """
 
 from __future__ import annotations
@@ -39,18 +39,18 @@ _SAME_M: Final = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class FetchedMap:
-    """What was made.
+    """Result of fetching a map.
 
     Attributes
     ----------
     path
         The map's directory.
     version, map_version
-        Of the published map.
+        Version number and map version of the published map.
     fetched_cells
-        Cells without those that a run that was stopped had.
+        Number of cells fetched, without those of an interrupted earlier run.
     fetched_bytes
-        Bytes of their objects that came from the store.
+        Bytes of the fetched cells' objects that were read from the store.
     """
 
     path: str
@@ -82,24 +82,24 @@ def fetch_map(
     Parameters
     ----------
     out
-        The directory to make; must not exist, or be empty, unless ``force`` replaces it.
+        The directory to create; it must be missing or empty, unless ``force`` replaces it.
     version
-        None: the current one.
+        Version to fetch; None: the current one.
     current
-        What is current, where that was verified; None: what ``CURRENT`` says.
+        The current version, if it was verified; None: the one in ``CURRENT``.
     tier
-        Objects that are there are not fetched; what is fetched is not kept in it.
+        Disk cache whose objects need not be fetched; fetched objects are not added to it.
 
     Raises
     ------
     BadRequest
         ``out`` exists, or the map cannot be written in that format.
     MapMissing, MapDataError, Offline
-        There is no such version, an object is gone or damaged, or the store does not answer.
+        The version does not exist, an object is missing or damaged, or the store does not answer.
     CannotWrite
         The disk is full or not writable.
     InstanceBusy
-        Another run is making ``out``.
+        Another run is writing ``out``.
     """
     out = os.path.abspath(out)
     if not force and os.path.lexists(out) and not (os.path.isdir(out) and not os.listdir(out)):
@@ -167,9 +167,9 @@ class _Fetch:
         return counts
 
     def _fetch(self, cell: _Cell) -> bool:
-        """Write a cell's file; False if it was there."""
+        """Write a cell's file; return False if it exists already."""
         path = os.path.join(self._cells_dir, cell.name)
-        if os.path.exists(path):  # files have their names once they are whole
+        if os.path.exists(path):  # a file gets its name only when it is complete
             return False
         frame = self._objects.read(cell.object.sha256, cell.object.size)
         unpacked = unpack_object(frame, cell.object, verified=True)
@@ -217,7 +217,7 @@ def _cells_of(shard: Shard) -> Iterator[_Cell]:
 
 
 def _only_size(low: NDArray[np.float64], high: NDArray[np.float64]) -> float:
-    """Find the size that all cells have along an axis, such that a corner and it give the box again."""
+    """Return the common size of all cells along an axis, such that corner plus size gives the box again."""
     sizes = high - low
     for size in (round(float(sizes[0]), 9), float(sizes[0])):
         if (low + size == high).all():
@@ -228,5 +228,5 @@ def _only_size(low: NDArray[np.float64], high: NDArray[np.float64]) -> float:
 
 
 def _number_text(value: float) -> str:
-    """Shortest text that gives the same bits, an integer whenever it is whole."""
+    """Return the shortest text that gives the same float; whole numbers as integers."""
     return str(int(value)) if value.is_integer() else repr(value)

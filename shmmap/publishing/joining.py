@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Joining a run: the parts of its slices become the current version, in one step.
+"""Joins a run: makes the parts of its slices the current version, in one step.
 
-Only a join switches the version, slices never do.  A join that is killed at any moment leaves the current
-version whole; run again, it finishes.
+Only a join switches the version, slices never do.  If a join is killed at any moment, the current version
+stays complete; running the join again finishes it.
 """
 
 from __future__ import annotations
@@ -58,24 +58,24 @@ if TYPE_CHECKING:
 
 __all__ = ["Joined", "join_slices", "numbers_text"]
 
-_OLD_S: Final = 6 * 86_400.0  # pruning may remove an object that no version names after seven days
+_OLD_S: Final = 6 * 86_400.0  # after seven days, pruning may remove objects that no version names
 _CONCURRENT_READS: Final = 16
 
 
 @dataclass(frozen=True, slots=True)
 class Joined:
-    """What a join came to.
+    """Result of a join.
 
     Attributes
     ----------
     version
-        The new version's number; None where the current one has these layers already.
+        Number of the new version; None if the current version already has these layers.
     current, map_version, root
         Number, map version, and hash of the root of the version that is current now.
     cells, layers
-        Of that version.
+        Cells and layers of that version.
     objects
-        How many were checked.
+        Number of objects that were checked.
     """
 
     run: RunName
@@ -91,28 +91,28 @@ class Joined:
 def join_slices(
     store: Store, run: str, *, progress: PrepareProgress, signer: MapSigner | None = None
 ) -> Joined:
-    """Make a version of the parts of all slices of a run, and make it current.
+    """Create a version from the parts of all slices of a run, and make it current.
 
     Parameters
     ----------
     run
-        Its name, as `prepare_slice` returns it.
+        Name of the run, as returned by `prepare_slice`.
     signer
-        Signs the version; needed for a map that is signed.
+        Signs the version; required for a signed map.
 
     Raises
     ------
     BadRequest
-        The name is not one of a run; the run was made from another version than the current one; the store is
+        ``run`` is not a run's name; the run was made from another version than the current one; the store is
         read-only; or the map is signed and there is no signer.
     MapMissing
         Nothing is published there, or slices are missing; the message names them.
     MapDataError
-        A part or an object that it names is damaged or gone, or the parts are of different builders.
+        A part, or an object that it names, is damaged or missing, or parts are from different builders.
     InstanceBusy
         Another publisher was quicker: its version is current.
     CannotWrite, Offline
-        The store refuses, does not answer, or it took longer than a day.
+        The store refuses or does not answer, or the join took longer than a day.
     """
     refuse_read_only(store)
     name = read_run(run)
@@ -124,7 +124,7 @@ def join_slices(
 
 
 class _Join:
-    """One join."""
+    """State of one join."""
 
     def __init__(
         self,
@@ -158,7 +158,7 @@ class _Join:
         step("join.root")
         send_object(self._store, blob_path(digest), frame)
         step("join.entry")
-        # from here on pruning spares its objects; objects removed before are found absent below
+        # from here on pruning spares the version's objects; the check below finds those removed earlier
         entry = new_entry(self._store, digest.hex(), len(frame), self._base.current)
         objects = self._look_for_objects(root, layers)
         step("join.looked")
@@ -196,7 +196,7 @@ class _Join:
     # --- parts ----------------------------------------------------------------------------------
 
     def _read_parts(self) -> dict[int, Part]:
-        """Read the parts that are there, by slice, ascending."""
+        """Read the existing parts, by slice number, ascending."""
         run, store = self._run, self._store
         found = (part_number(run, listed.path) for listed in store.list(run.path))
         numbers = sorted(number for number in found if number is not None)
@@ -213,7 +213,7 @@ class _Join:
             with ThreadPoolExecutor(_CONCURRENT_READS, "part") as threads:
                 return {part.slice: part for part in threads.map(read, numbers)}
         except MapMissing:
-            self._refuse_if_changed()  # another join has removed it
+            self._refuse_if_changed()  # another join may have removed the part
             raise
 
     def _refuse_if_changed(self) -> None:
@@ -221,7 +221,7 @@ class _Join:
             raise changed_meanwhile(self._store)
 
     def _are_joined(self, parts: Mapping[int, Part]) -> bool:
-        """Whether the current version has all of these parts: then a join was killed after its switch."""
+        """Whether the current version contains all these parts: a join was killed after its switch."""
         root = self._base.root
         has_shards = False
         for part in parts.values():
@@ -238,7 +238,7 @@ class _Join:
         return has_shards and all(part.root_content != self._base.content for part in parts.values())
 
     def _check(self, parts: Mapping[int, Part]) -> None:
-        """Refuse the parts unless they are of all slices, of the current version, and by one builder."""
+        """Check that the parts are of all slices, of the current version, and by one builder version."""
         run, store, base = self._run, self._store, self._base
         if not parts:
             self._refuse_if_changed()
@@ -279,7 +279,7 @@ class _Join:
                 )
 
     def _remove(self, parts: Mapping[int, Part]) -> None:
-        """Remove the parts, those without shards first: they alone do not show that the run was joined."""
+        """Remove the parts, those without shards first: only parts with shards show that a run is joined."""
         for number, _ in sorted(parts.items(), key=lambda one: len(one[1].keys)):
             step("join.part")
             self._store.delete(self._run.part_path(number))
@@ -287,11 +287,14 @@ class _Join:
     # --- objects --------------------------------------------------------------------------------
 
     def _look_for_objects(self, root: Root, layers: Collection[str]) -> int:
-        """Check that all objects of a root are there; it may differ from the current one in these layers."""
+        """Check that all objects of a root exist, and return the number checked.
+
+        The root may differ from the current one in ``layers``.
+        """
         base = self._base.root
         belongs = slice_of_shards(base, self._run.slices).tolist()
         since_s = time.time() - _OLD_S
-        absent: dict[int, int] = {}  # number of objects by slice; 0: of the version before
+        absent: dict[int, int] = {}  # number of missing objects by slice; 0: those of the version before
         looked = 0
         self._progress.stage("look for objects", root.cells)
         shards = zip(belongs, read_shards(self._store, base), read_shards(self._store, root), strict=True)
@@ -330,7 +333,7 @@ class _Join:
 
 
 def numbers_text(numbers: Iterable[int]) -> str:
-    """Return ascending numbers as text, runs of them as ``first-last``: ``3, 7-9``."""
+    """Return ascending numbers as text, with ranges as ``first-last``, e.g. ``3, 7-9``."""
     ordered = list(numbers)
     places = [number - place for place, number in enumerate(ordered)]
     found = []

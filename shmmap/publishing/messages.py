@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run and its publishing workers exchange: settings, messages, and a table of known objects.
+"""Data that a run and its publishing workers exchange: settings, messages, and a table of known objects.
 
-Their tasks are `shmmap.prepare.task_pool.CellTask`.
+The workers' tasks are `shmmap.prepare.task_pool.CellTask`.
 """
 
 from __future__ import annotations
@@ -32,23 +32,23 @@ __all__ = [
 
 
 TASKS_AHEAD: Final = 8
-"""Cells that a worker has at a time: as many are sent while the next is made."""
+"""Cells assigned to a worker at a time, so that finished cells are sent while the next one is made."""
 
 
 class PublishSettings(msgspec.Struct, array_like=True):
-    """What all workers of a run need.
+    """Settings of all workers of a run.
 
     Attributes
     ----------
     known
-        File with the objects of the version before, see `shmmap.publishing.messages`; empty: none.
+        File with the objects of the version before, see `KnownObjects`; empty: none.
     is_first
-        Nothing was ever sent there: no object is looked for.
+        Whether to send every object without first checking whether the store has it.
     cache_dir
-        Where prepared layers may lie; empty: nowhere.
+        Directory of the cache that may contain prepared layers; empty: no cache.
     encoding
-        One of `shmmap.origin.remote.published_index.ENCODINGS`; empty: that of the version before, at first
-        ``exact``.
+        One of `shmmap.origin.remote.published_index.ENCODINGS`; empty: that of the version before, or
+        ``exact`` for the first version.
     """
 
     url: str
@@ -61,14 +61,14 @@ class PublishSettings(msgspec.Struct, array_like=True):
 
 
 class SliceSettings(msgspec.Struct, array_like=True):
-    """What all workers of a slice need.
+    """Settings of all workers of a slice.
 
     Attributes
     ----------
     cache_dir, cache_bytes
-        Where computed layers are kept, and at most how many bytes; 0: none are.
+        Directory that keeps computed layers, and its size limit in bytes; 0: none are kept.
     keep_points
-        Keep fetched points there, too: several cells need them.
+        Keep fetched points there, too, because several cells need them.
     """
 
     url: str
@@ -80,7 +80,7 @@ class SliceSettings(msgspec.Struct, array_like=True):
 
 
 class LayerSent(msgspec.Struct, array_like=True):
-    """One layer: its object, and how many bytes of it were sent; 0: it was there."""
+    """One layer: its object, and the number of bytes sent; 0: the store had the object already."""
 
     sha256: bytes
     size: int
@@ -90,7 +90,7 @@ class LayerSent(msgspec.Struct, array_like=True):
 
 
 class CellSent(msgspec.Struct, array_like=True, tag="sent"):
-    """All layers of a cell are there, in the order of the task."""
+    """Message that the store has all layers of a cell; layers are in the order of the task."""
 
     number: int
     points: int
@@ -100,7 +100,7 @@ class CellSent(msgspec.Struct, array_like=True, tag="sent"):
 
 
 class NotSent(msgspec.Struct, array_like=True, tag="not_sent"):
-    """A cell is not: a layer cannot be made (``layer`` is its spec), or the store refuses (empty)."""
+    """Message that a cell was not sent: a layer cannot be made (``layer``), or the store refuses (empty)."""
 
     number: int
     layer: str
@@ -113,14 +113,14 @@ FromWorker: TypeAlias = CellSent | NotSent | Ready
 
 _sent: Final[msgspec.msgpack.Decoder[FromWorker]] = msgspec.msgpack.Decoder(FromWorker)
 decode_sent: Final = _sent.decode
-"""Reads a worker's message."""
+"""Decodes a worker's message."""
 
 
 _ROW: Final = np.dtype([("content", "S32"), ("sha256", "V32"), ("size", "<u4"), ("raw", "<u4")])
 
 
 def write_known_objects(path: str | os.PathLike[str], layers: Iterable[LayerObjects]) -> int:
-    """Write the table of these objects, ascending by their content; returns how many they are."""
+    """Write the table of these objects, ascending by content digest, and return their number."""
     parts: list[NDArray[Any]] = []
     for layer in layers:
         rows = np.empty(len(layer.sizes), _ROW)
@@ -135,7 +135,7 @@ def write_known_objects(path: str | os.PathLike[str], layers: Iterable[LayerObje
 
 
 class KnownObjects:
-    """The table in a file; an empty path has none."""
+    """Table of known objects in a file; with an empty path, an empty table."""
 
     def __init__(self, path: str) -> None:
         empty = not path or not os.path.getsize(path)
@@ -147,7 +147,7 @@ class KnownObjects:
         if at == len(self._table):
             return None
         row = self._table[at]
-        # numpy leaves out zero bytes at the end of a text
+        # numpy drops trailing zero bytes of a text
         if row["content"].ljust(32, b"\0") != content:
             return None
         return ObjectName(row["sha256"].tobytes(), int(row["size"]), int(row["raw"]), content)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What publishing, joining and restoring share: objects are made, sent or looked for, a version switched to.
+"""Steps that publishing, joining and restoring share: they send or check objects, then switch the version.
 
 The objects of the version are sent or checked between `begin_version` and `switch_version`.
 """
@@ -44,16 +44,16 @@ __all__ = [
 
 CONCURRENT_REQUESTS: Final = 32
 _YOUNG_S: Final = 86_400.0
-"""An object that no version has is used again if it is younger: pruning spares it for much longer."""
+"""Age below which an existing object is reused even if no version has it; pruning spares it much longer."""
 
 
 def send_object(store: Store, path: str, frame: bytes, *, look: bool = True) -> bool:
-    """Send an object unless the store has it; returns whether it was sent.
+    """Send an object unless the store has it, and return whether it was sent.
 
     Parameters
     ----------
     look
-        False: it cannot be there.
+        Whether to check first if the store has the object.
     """
     if look:
         found = store.head(path)
@@ -67,12 +67,12 @@ def send_object(store: Store, path: str, frame: bytes, *, look: bool = True) -> 
 def absent_objects(
     store: Store, objects: Iterable[tuple[bytes, int]], threads: Executor, *, since_s: float = 0.0
 ) -> list[bytes]:
-    """Return which objects, by hash and size, are not in the store.
+    """Return the hashes of the objects, given by hash and size, that are missing in the store.
 
     Parameters
     ----------
     since_s
-        Unix time: objects written before it count as absent, too.
+        Unix time; objects written earlier also count as missing.
     """
 
     def is_absent(named: tuple[bytes, int]) -> bool:
@@ -93,19 +93,19 @@ def run_workers(
     finished: Callable[[CellTask, CellSent | NotSent], None],
     died: Callable[[CellTask, str], None],
 ) -> None:
-    """Run worker processes of ``module``, which make layers of cells and send them, until all tasks are done.
+    """Run workers of ``module``, which make and send layers of cells, until all tasks are done.
 
     Parameters
     ----------
     finished
-        Called with what came of each task.
+        Called with each task and its result.
     died
-        Called with a task that its worker died of, and how.
+        Called with a task whose worker crashed, and a description of the crash.
 
     Raises
     ------
     ShmmapError
-        The store refuses an object: it would refuse every other, too.
+        The store refuses an object, and so would refuse all others.
     """
 
     def answered(task: CellTask, done: CellSent | NotSent) -> None:
@@ -125,7 +125,7 @@ def run_workers(
     pool.run(tasks)
 
 
-_MAX_RUN_S: Final = 86_400.0  # objects that a run reuses must not become as old as those that pruning removes
+_MAX_RUN_S: Final = 86_400.0  # so that reused objects do not reach the age at which pruning removes them
 
 
 def begin_version(store: Store, signer: MapSigner | None, verb: str) -> CurrentState:
@@ -136,7 +136,7 @@ def begin_version(store: Store, signer: MapSigner | None, verb: str) -> CurrentS
     signer
         Signs the new version; None for a map that is not signed.
     verb
-        What to do with the keys, for the hint: ``"publish it"``.
+        Action that needs the keys, for the hint: ``"publish it"``.
 
     Raises
     ------
@@ -150,13 +150,13 @@ def begin_version(store: Store, signer: MapSigner | None, verb: str) -> CurrentS
 
 
 def refuse_if_late(began_s: float, what: str, hint: str) -> None:
-    """Raise `CannotWrite` if a run that began then, by `time.monotonic`, took longer than a day."""
+    """Raise `CannotWrite` if more than a day has passed since ``began_s`` (`time.monotonic`)."""
     if time.monotonic() - began_s > _MAX_RUN_S:
         raise CannotWrite(f"{what} took longer than a day: the version is not made current", hint=hint)
 
 
 def switch_version(store: Store, entry: Entry, seen: CurrentState, signer: MapSigner | None) -> None:
-    """Make the version of an entry current, unless another one than ``seen`` is: `InstanceBusy`."""
+    """Make an entry's version current; raise `InstanceBusy` if ``seen`` is no longer current."""
     if signer is None:
         add_version(store, entry, seen)
     else:

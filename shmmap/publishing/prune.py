@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Removing versions that have not been current for long, and the objects that no version has.
+"""Removes versions that have not been current for a long time, and objects that no version has.
 
-Entries go first; then the entries are listed again, and only objects that none of these has, and that are as
-old, are removed.  So whatever is being published, restored or read meanwhile keeps its objects.  Parts of
-slices that are as old were never joined, and are removed as well.
+Entries of old versions are removed first.  Then the entries are listed again, and only old objects that none
+of the remaining versions has are removed.  So versions that are published, restored or read meanwhile keep
+their objects.  Equally old parts of slices were never joined, and are removed as well.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _BLOBS: Final = "blobs/"
 
 @dataclass(slots=True)
 class Pruned:
-    """What was removed: numbers of versions, objects and their bytes, parts of slices; and what is kept."""
+    """Result of pruning: removed versions, objects, bytes and parts of slices, and what was kept."""
 
     versions: list[int] = field(default_factory=list)
     objects: int = 0
@@ -53,19 +53,19 @@ class Pruned:
 
 
 def prune_versions(store: Store, *, keep_days: float = KEEP_DAYS, progress: PrepareProgress) -> Pruned:
-    """Remove versions that have not been current for ``keep_days``, and what only they have.
+    """Remove versions that have not been current for ``keep_days``, and objects that only they have.
 
     Parameters
     ----------
     keep_days
-        7 or more.
+        Days, 7 or more.
 
     Raises
     ------
     BadRequest
-        ``keep_days`` is too few, the store is read-only, or another version is signed than is current.
+        ``keep_days`` is too small, the store is read-only, or the signed version is not the current one.
     MapMissing, MapDataError, Offline
-        Nothing is published there; a version that is kept cannot be read: its objects are unknown.
+        Nothing is published there, or a version to keep cannot be read, so that its objects are unknown.
     """
     refuse_read_only(store)
     if not keep_days >= LEAST_KEEP_DAYS:
@@ -86,7 +86,7 @@ def prune_versions(store: Store, *, keep_days: float = KEEP_DAYS, progress: Prep
 
 
 def _require_signed(store: Store, current: Current) -> None:
-    """Refuse where a signed map's metadata, which is not verified for this, names another version."""
+    """Refuse if a signed map's metadata, which is not verified here, names another version."""
 
     def read(path: str) -> dict[str, Any]:
         signed: dict[str, Any] = json.loads(bytes(store.get(path, MAX_METADATA_BYTES)))["signed"]
@@ -108,9 +108,9 @@ def _require_signed(store: Store, current: Current) -> None:
 
 
 def _old_versions(store: Store, current: Current, old_s: float) -> list[int]:
-    """Versions that have not been current since then, or were made before and never served; ascending."""
+    """Return versions not current since ``old_s``, or made before it and never served; ascending."""
     old: list[int] = []
-    replaced_s: float | None = None  # when the one after it became current
+    replaced_s: float | None = None  # time at which the following version was made
     served: set[int] = set()
     for entry in earlier_versions(store, current):
         served.add(entry.version)
@@ -128,12 +128,12 @@ def _old_versions(store: Store, current: Current, old_s: float) -> list[int]:
 def _entry(store: Store, version: int) -> Entry | None:
     try:
         return read_entry(store, version)
-    except MapMissing:  # pruned by another one
+    except MapMissing:  # pruned by another process
         return None
 
 
 def _needed(store: Store, progress: PrepareProgress, result: Pruned) -> set[bytes]:
-    """Hashes of all objects that a version has: of what is listed now, and of what is current now."""
+    """Return the hashes of all objects of the versions that are listed or current now."""
     roots: dict[str, Current] = {}
     for version in list_entries(store):
         if (entry := _entry(store, version)) is not None:
@@ -147,7 +147,7 @@ def _needed(store: Store, progress: PrepareProgress, result: Pruned) -> set[byte
     for named in roots.values():
         try:
             needed.update(objects_of(store, named))
-        except MapMissing:  # what was never served need not be whole
+        except MapMissing:  # a version that was never served may be incomplete
             if named.root in served:
                 raise
         progress.advance(1)
@@ -155,7 +155,7 @@ def _needed(store: Store, progress: PrepareProgress, result: Pruned) -> set[byte
 
 
 def _remove_parts(store: Store, old_s: float) -> int:
-    """Remove old parts of slices; returns how many."""
+    """Remove old parts of slices, and return their number."""
     old = [found.path for found in store.list(PARTS) if found.modified_s < old_s]
     removed = 0
     for path in old:
@@ -186,7 +186,7 @@ def _remove_objects(
 
 
 def _remove_if_old(store: Store, path: str, old_s: float) -> bool:
-    """Remove an object, unless a publisher has sent it again since it was listed."""
+    """Remove an old object, unless a publisher has sent it again since it was listed."""
     found = store.head(path)
     if found is None or found.modified_s >= old_s:
         return False

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Publishing a map: what is new of it is sent, and then all of it becomes the current version at once.
+"""Publishes a map: sends its new objects, then makes all of it the current version atomically.
 
-Killed at any moment, the version that was current is whole; run again, what was sent is not sent again.
+If a run is killed at any moment, the version that was current stays complete.  A second run does not send the
+objects again that the first one has sent.
 """
 
 from __future__ import annotations
@@ -62,18 +63,18 @@ _SHARDS_PER_BATCH: Final = 16
 
 @dataclass(slots=True)
 class Published:
-    """What a run came to.
+    """Result of publishing.
 
     Attributes
     ----------
     version
-        The new version's number; None where nothing has changed or a layer could not be made.
+        Number of the new version; None if nothing has changed or a layer could not be made.
     current
-        The number of the version that is current now; 0 where there is none.
+        Number of the version that is current now; 0 if there is none.
     root
         SHA-256 of the root's object.
     objects, sent_objects, sent_bytes
-        Objects of the version's layers; what was sent: all objects, and their bytes.
+        Number of objects of the version's layers; number and bytes of all objects that were sent.
     bytes
         Bytes of the objects of all layers.
     """
@@ -94,7 +95,7 @@ class Published:
 
 
 class _ShardRow(NamedTuple):
-    """What the root says of a shard."""
+    """The root's row for a shard."""
 
     key: tuple[int, int]
     cells: int
@@ -119,28 +120,29 @@ def publish_map(
     Parameters
     ----------
     store, settings
-        Where, and how workers open it; what is known there is filled in here.
+        The store, and the settings by which workers open it; `publish_map` fills in the known objects.
     layers
         Specs of layers besides ``points``, in any form.
     id_prefix
-        What ids begin with; empty: as before, at first ``/<last part of the URL>/``.
+        Prefix of all ids; empty: that of the version before, or ``/<last part of the URL>/`` for the first.
     resend
-        Send every object again, as if none were there, and make that a version.
+        Send every object again, as if the store had none, and make this a new version.
     signer
-        Signs the version; needed for a map that is signed.
+        Signs the version; required for a signed map.
     workers
-        How many processes make layers.
+        Number of processes that make layers.
 
     Returns
     -------
-    What came of it.  With failures nothing was made current.
+    The result.  If it has failures, no version was made current.
 
     Raises
     ------
     BadRequest
-        A layer is unknown, the prefix is not that of the versions before, or the store is read-only.
+        A layer is unknown, the prefix differs from that of earlier versions, or the store is read-only.
     Offline, CannotWrite, MapDataError
-        The store does not answer or refuses; its current version is damaged; it took longer than a day.
+        The store does not answer or refuses; its current version is damaged; or the run took longer than a
+        day.
     InstanceBusy
         Another publisher was quicker: its version is current.
     """
@@ -153,7 +155,7 @@ def publish_map(
 
 
 def packed_root(root: Root, url: str) -> bytes:
-    """Return a root unpacked; `MapDataError` if it is too large for readers."""
+    """Return the unpacked bytes of a root; raise `MapDataError` if they are too many for readers."""
     unpacked = pack_root(root)
     if len(unpacked) > MAX_ROOT_BYTES:
         raise MapDataError(
@@ -166,7 +168,7 @@ def packed_root(root: Root, url: str) -> bytes:
 
 
 class _Run:
-    """One run: what it publishes, and what was current when it began."""
+    """State of one run: the map it publishes, and the version that was current when it began."""
 
     def __init__(
         self,
@@ -187,7 +189,7 @@ class _Run:
         self._signer = signer
         self._seen = begin_version(store, signer, "publish it")
         self._before: Root | None = self._read_root()
-        self._shards: dict[tuple[int, int], tuple[bytes, int]] = {}  # before: key, content, row of the root
+        self._shards: dict[tuple[int, int], tuple[bytes, int]] = {}  # last version: key, content, root row
         has_none = self._before is None and next(iter(store.list("blobs/")), None) is None
         self._look = not (resend or has_none)
         self._result = Published(len(catalogue), names)
@@ -255,7 +257,7 @@ class _Run:
         return wanted or f"/{last}/"
 
     def _known_layers(self) -> Iterator[LayerObjects]:
-        """Yield the objects of the version before, by shard and layer; none where all is sent again."""
+        """Yield the objects of the version before, by shard and layer; none if everything is sent again."""
         root = self._before
         if root is None or self._resend:
             return
@@ -269,7 +271,7 @@ class _Run:
     # --- sending --------------------------------------------------------------------------------
 
     def _send_cells(self, settings: PublishSettings, workers: int) -> CellObjects:
-        """Bring the objects of all cells into the store; failures go into the result."""
+        """Send the objects of all cells to the store; failures are added to the result."""
         catalogue, result = self._catalogue, self._result
         objects = CellObjects(len(catalogue), self._names)
         versions = LayerVersions(lambda: catalogue)
@@ -306,7 +308,7 @@ class _Run:
         self._result.sent_bytes += sent_bytes
 
     def _send_shards(self, objects: CellObjects, side: float) -> list[_ShardRow]:
-        """Send the shards that are new, and return what the root says of all."""
+        """Send new shards, and return the root's rows for all shards."""
         rows: list[_ShardRow] = []
         self._progress.stage("index", len(self._catalogue))
         divided = divide_into_shards(self._catalogue, objects, side)

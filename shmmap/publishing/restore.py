@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An earlier version's content becomes current again, under a new number."""
+"""Makes an earlier version's content current again, under a new number."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _NAMED: Final = 3
 
 
 class Restored(NamedTuple):
-    """``version`` is the new number, None where that content is current; ``objects`` were looked for."""
+    """Result: number of the new version (None: that content is already current), and of checked objects."""
 
     version: int | None
     restored: int
@@ -44,16 +44,16 @@ class Restored(NamedTuple):
 def restore_version(
     store: Store, version: int, progress: PrepareProgress, signer: MapSigner | None = None
 ) -> Restored:
-    """Make the content of an earlier version current again, all of whose objects must be there.
+    """Make the content of an earlier version current again; all its objects must still exist.
 
     Raises
     ------
     MapMissing
-        Nothing is published, or there is no such version (any more).
+        Nothing is published, or the version does not exist (any more).
     BadRequest
-        It was never served.
+        The version was never served.
     MapDataError
-        Some of its objects are gone.
+        Some objects of the version are missing.
     InstanceBusy
         Another publisher has switched meanwhile.
     """
@@ -76,7 +76,7 @@ def restore_version(
     if old.root == seen.current.root:
         return Restored(None, version, seen.current.version, 0)
     step("restore.entry")
-    # from here on pruning spares its objects; had it begun before, the old entry would be gone now
+    # from here on pruning spares the objects; if it began earlier, the old entry is missing now
     entry = new_entry(store, old.root, old.bytes, seen.current, restored=version)
     _require_entry(store, old)
     objects = _look_for_objects(store, old.current, progress)
@@ -99,7 +99,7 @@ def _look_for_objects(store: Store, current: Current, progress: PrepareProgress)
     looked = 0
 
     with ThreadPoolExecutor(CONCURRENT_REQUESTS, "head") as threads:
-        for shard in read_shards(store, root):  # which reads the shards themselves
+        for shard in read_shards(store, root):  # reading shows that the shards exist
             objects = {named for layer in shard.layers.values() for named in layer.objects()}
             missing += map(blob_path, absent_objects(store, sorted(objects), threads))
             looked += len(objects)
@@ -116,12 +116,12 @@ def _look_for_objects(store: Store, current: Current, progress: PrepareProgress)
 
 
 def objects_of(store: Store, current: Current) -> Iterator[bytes]:
-    """Hashes of all objects of a version: its root, shards, and layers.
+    """Yield the hashes of all objects of a version: its root, shards, and layers.
 
     Raises
     ------
     MapMissing, MapDataError, Offline
-        Its root or a shard cannot be read.
+        The root or a shard cannot be read.
     """
     root: Root = read_root(store, current)
     yield bytes.fromhex(current.root)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The index of a map that is about to be published: its cells' objects, divided into shards."""
+"""Index of a map to be published: the objects of its cells, divided into shards."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class CellObjects:
         }
 
     def set(self, row: int, cell: CellSent) -> None:
-        """Fill in a cell."""
+        """Fill in the objects of a cell."""
         if cell.points:
             self.z[row] = cell.z_min, cell.z_max
         self.points[row] = cell.points
@@ -58,24 +58,24 @@ class CellObjects:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all objects; those that several cells share count for each."""
+        """Total bytes of all objects; an object that several cells share counts once for each cell."""
         return sum(int(objects.sizes.sum(dtype=np.uint64)) for objects in self.layers.values())
 
 
 def check_names(catalogue: Catalogue) -> None:
-    """Refuse a map in which the name of a cell is no text (`BadRequest`)."""
+    """Raise `BadRequest` if the name of a cell is not valid text."""
     for name in catalogue.names.tolist():
         if not is_relative_path(name):
             raise BadRequest(f"a cell named {name!r} cannot be published", hint="rename its file")
 
 
 def shard_side(catalogue: Catalogue, layers: int, before: float | None) -> float:
-    """Return the side of a shard in metres: some 32 cells; that of the version before while it will do.
+    """Return the side of a shard in metres, for about 32 cells; that of the last version while suitable.
 
     Raises
     ------
     MapDataError
-        Too many cells begin at one place, or one lies too far out.
+        Too many cells begin at the same position, or a cell is too far away.
     """
     mean_x, mean_y = catalogue.mean_size
     ideal = _rounded(_CELLS_ALONG_A_SHARD * (max(mean_x, mean_y) or 1.0))
@@ -96,7 +96,7 @@ def shard_side(catalogue: Catalogue, layers: int, before: float | None) -> float
 
 
 def _rounded(length: float) -> float:
-    """Round a length to three digits, so that it does not change with the last bit of a mean."""
+    """Round a length to three digits, so that it does not depend on the last bit of a mean."""
     return float(f"{length:.3g}") if math.isfinite(length) and length > 0 else 1.0
 
 
@@ -105,7 +105,7 @@ def divide_into_shards(
 ) -> Iterator[tuple[tuple[int, int], Shard]]:
     """Yield the key (row, column) of each shard, ascending, and the shard."""
     keys = shard_keys(catalogue.boxes, side).astype(np.int64)
-    order = np.lexsort((np.arange(len(keys)), keys[:, 1], keys[:, 0]))  # within a shard by name, as they are
+    order = np.lexsort((np.arange(len(keys)), keys[:, 1], keys[:, 0]))  # cells of a shard stay in name order
     ordered = keys[order]
     begins = np.flatnonzero(np.r_[True, (ordered[1:] != ordered[:-1]).any(axis=1)])
     for begin, end in zip(begins.tolist(), [*begins[1:].tolist(), len(order)], strict=True):

@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Signing a published map: its keys, and the metadata that names its current version.
+"""Signs a published map: manages its keys, and the metadata that names its current version.
 
-Three keys: ``root.pem`` names the others, is needed to make and to rotate them, and belongs offline;
-``targets.pem`` signs versions, where one publishes; ``online.pem`` signs snapshot and timestamp, which is all
-that a refresh needs.  What vehicles trust is ``ROOT.json``.  A version is current as soon as the timestamp
-names it; ``CURRENT`` follows, for vehicles that verify nothing, and is repaired when the map is signed next.
+There are three keys.  ``root.pem`` authorises the others, is needed to make and to rotate them, and should
+be kept offline.  ``targets.pem`` signs versions on the machine that publishes.  ``online.pem`` signs snapshot
+and timestamp, and is the only key that a refresh needs.  Vehicles trust ``ROOT.json``.  A version is current
+as soon as the timestamp names it.  ``CURRENT`` is updated afterwards, for vehicles that do not verify; if
+that fails, the next signing repairs it.
 
-A rotation keeps the map valid at each moment, also for a vehicle that reads in the middle of it, and wherever
-it is killed.  The next key lies beside the old one, as ``<name>.next.pem``.  A new root names
-both of them; what they sign is signed again by both; then another root names the next key alone, which
-replaces the old one.  The root's own key needs one root only, signed by the old key and the next.
+The map stays valid at each moment of a rotation, even if the rotation is killed.  The next key is stored
+beside the old one, as ``<name>.next.pem``.  A new root names both keys, and the metadata is signed again by
+both; then another root names only the next key, which replaces the old one.  To rotate the root's own key
+takes only one root, signed by the old and the next key.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ _Role = TypeVar("_Role", Root, Timestamp, Snapshot, Targets)
 
 
 class Refreshed(NamedTuple):
-    """What a refresh signed: the version that stays current, and until when each role is valid."""
+    """Result of a refresh: the version that stays current, and the expiry of each role."""
 
     current: Current
     timestamp: datetime
@@ -79,7 +80,7 @@ class Refreshed(NamedTuple):
 
 
 class Rotated(NamedTuple):
-    """What was rotated: the roles that have another key, its file, and the number of the newest root."""
+    """Result of a rotation: the roles with a new key, the key's file, and the number of the newest root."""
 
     roles: tuple[str, ...]
     key: str
@@ -92,16 +93,16 @@ class MapSigner:
     Parameters
     ----------
     directory
-        Where the keys are.  Made, with keys, where there are none and nothing is signed at the store.
+        Directory of the keys.  If it has none and nothing is signed at the store, both are created.
 
     Raises
     ------
     ConfigError
-        A key can be read by others, is not a key, or is not the one that the root of trust names.
+        A key's file is readable by others, is not a key, or is not the key that the root of trust names.
     BadRequest
         The map is signed, and these are not its keys; or the store is read-only.
     MapDataError
-        What is signed there is damaged, or signed by other keys.
+        The store's signed metadata is damaged, or signed by other keys.
     """
 
     def __init__(self, store: Store, directory: str, *, make_keys: bool = True) -> None:
@@ -126,14 +127,14 @@ class MapSigner:
             self._finish_rotation(name)
 
     def begin(self) -> CurrentState:
-        """Return what is current, for a new version: what is signed, or what ``CURRENT`` says if nothing is.
+        """Return the version that a new one replaces: the signed one, or that in ``CURRENT`` if none is.
 
-        Entry and ``CURRENT`` are repaired where they differ.
+        Entry and ``CURRENT`` are repaired if they differ from the signed version.
 
         Raises
         ------
         ConfigError
-            A key that a version needs is not here, or cannot be used.
+            A key for signing versions is missing, or cannot be used.
         """
         for role in (Targets.type, Timestamp.type):
             self._signers(role)
@@ -141,7 +142,7 @@ class MapSigner:
 
     def _repaired(self) -> CurrentState:
         for _ in range(_MAX_TRIES):
-            seen = read_current(self._store)  # before: so it is never ahead of what is signed
+            seen = read_current(self._store)  # read first, so that it is never newer than the signed state
             state = self._state()
             if state is None or state.current == seen.current:
                 return seen
@@ -149,12 +150,12 @@ class MapSigner:
         raise InstanceBusy(f"other publishers keep changing {self._store.url}", hint="try again later")
 
     def switch(self, entry: Entry) -> None:
-        """Sign a new version, whose entry is made, and have ``CURRENT`` follow.
+        """Sign a new version, whose entry exists, and then update ``CURRENT``.
 
         Raises
         ------
         InstanceBusy
-            Another publisher has signed one meanwhile: that stays.
+            Another publisher has signed a version meanwhile, which stays.
         """
         self._sign(entry.current, entry.before)
         step("sign.signed")
@@ -162,16 +163,16 @@ class MapSigner:
         step("sign.switched")
 
     def keep(self, current: Current) -> None:
-        """Sign the current version where nothing has changed, and again in time."""
+        """Sign the current version if it is unsigned, and renew signatures after half of their validity."""
         self._sign(current, current.version)
 
     def refresh(self) -> Refreshed:
-        """Sign the timestamp again, and the snapshot when half of its time is over; `CURRENT` is repaired.
+        """Sign the timestamp again, the snapshot after half of its validity, and repair ``CURRENT``.
 
         Raises
         ------
         MapMissing
-            Nothing is signed there.
+            The store has no signed map.
         """
         if self._state() is None:
             raise MapMissing(
@@ -187,18 +188,18 @@ class MapSigner:
         )
 
     def rotate(self, role: str) -> Rotated:
-        """Give a role another key; snapshot and timestamp share one, so both get it.
+        """Replace the key of a role; snapshot and timestamp share a key, so both get the new one.
 
-        The old key is removed.  A rotation that was killed continues.
+        The old key is removed.  A rotation that was killed is continued.
 
         Raises
         ------
         MapMissing
-            Nothing is signed there.
+            The store has no signed map.
         ConfigError
-            A key that is needed is not here; ``root.pem`` always is needed.
+            A required key is missing; ``root.pem`` is always required.
         InstanceBusy
-            Another rotation came between.
+            Another rotation ran meanwhile.
         """
         if self._state() is None:
             raise MapMissing(
@@ -221,13 +222,13 @@ class MapSigner:
         self._add_root(roles, following, keep=False)
         step("sign.rotated")
         if role != Root.type:
-            # a publisher with the old key may have signed meanwhile; after this none can
+            # a publisher with the old key may have signed until now; after this root none can
             self._sign(None, 0, read_under=before)
         self._finish_rotation(name)
         return Rotated(roles, self._key_path(name), self._root.signed.version)
 
     def _add_root(self, roles: Sequence[str], following: CryptoSigner, *, keep: bool) -> None:
-        """Write the next root, which gives roles this key, beside their old ones if ``keep``."""
+        """Write the next root, which gives roles the key ``following``, besides the old one if ``keep``."""
         signers = self._signers(Root.type)
         root = copy.deepcopy(self._root.signed)
         root.version += 1
@@ -247,7 +248,7 @@ class MapSigner:
         self._root = Metadata.from_bytes(data)
 
     def _finish_rotation(self, name: str) -> None:
-        """Replace the old key by the next one, once the root no longer names the old one."""
+        """Replace the old key's file by the next one's, if the root no longer names the old key."""
         following = self._key_path(f"{name}.next")
         if not os.path.lexists(following):
             return
@@ -265,22 +266,22 @@ class MapSigner:
     def _sign(
         self, current: Current | None, before: int, *, read_under: Metadata[Root] | None = None
     ) -> SignedState:
-        """Make targets, snapshot and timestamp name ``current``; None: what is named already.
+        """Make targets, snapshot and timestamp name ``current``; None: the version they already name.
 
-        ``before`` is the version that was current when this one was made: if another one is by now, that
-        one stays.  ``read_under`` is the root whose keys signed the present state, if that is not the
-        newest one.
+        ``before`` is the version that was current when this one was made: if another version is current by
+        now, that one stays.  ``read_under`` is the root whose keys signed the present state, if that is not
+        the newest root.
         """
         made: tuple[Current, int, Metadata[Targets]] | None = None
         for _ in range(_MAX_TRIES):
             state = read_signed_state(self._store, read_under or self._root)
-            if self._has_newer_root():  # read after the state: what replaces that is signed by its keys
+            if self._has_newer_root():  # read after the state, whose successor needs this root's keys
                 continue
             named = state.current if state is not None else None
             if current is not None and named is not None and named != current and named.version != before:
                 raise changed_meanwhile(self._store)
             wanted = current or named
-            assert wanted is not None  # noqa: S101  a refresh and a rotation have looked
+            assert wanted is not None  # noqa: S101  refresh and rotation have checked this
             targets = seen = state.targets if state is not None else None
             is_over = targets is None or named != wanted or (current is not None and _is_half_over(targets))
             if targets is None or is_over or not self._is_signed(targets):
@@ -298,7 +299,7 @@ class MapSigner:
                 meta = {f"{Targets.type}.json": MetaFile(targets.signed.version)}
                 snapshot = self._add(Snapshot, snapshot, Snapshot(meta=meta))
             elif state is not None and current is not None and not _is_half_over(state.timestamp):
-                return state  # a refresh signs the timestamp again in any case, and so does a rotation
+                return state  # refresh and rotation always sign the timestamp again
             written = self._write_timestamp(state, snapshot, targets)
             if written is not None:
                 return written
@@ -307,7 +308,7 @@ class MapSigner:
     def _write_timestamp(
         self, state: SignedState | None, snapshot: Metadata[Snapshot], targets: Metadata[Targets]
     ) -> SignedState | None:
-        """Replace the timestamp if it is the one that was seen; None: it is another one now."""
+        """Replace the timestamp if it is still that of ``state``; return None if it has changed."""
         before = state.timestamp.signed.version if state is not None else 0
         signed = Timestamp(
             version=before + 1,
@@ -322,7 +323,7 @@ class MapSigner:
         return SignedState(Metadata.from_bytes(data), {}, snapshot, targets)
 
     def _add(self, kind: type[_Role], before: Metadata[_Role] | None, signed: _Role) -> Metadata[_Role]:
-        """Write metadata under the next free number: those that were never named are passed over."""
+        """Write metadata under the next free number, skipping numbers of metadata that was never named."""
         signed.expires = _now() + LIFETIMES[kind.type]
         first = before.signed.version + 1 if before is not None else 1
         for number in range(first, first + _MAX_TRIES):
@@ -337,18 +338,18 @@ class MapSigner:
         return _signed_by(signed, self._signers(signed.type))
 
     def _has_newer_root(self) -> bool:
-        """Read the newest root; True if keys were rotated since it was last read."""
+        """Read the newest root; return True if keys were rotated since the last read."""
         newest = newest_root(self._store, self.trusted)
         before, self._root = self._root, newest
         return newest.signed.version != before.signed.version
 
     def _is_signed(self, metadata: Metadata[_Role]) -> bool:
-        """Whether all keys that are here have signed it; False in the middle of a rotation."""
+        """Whether all local keys have signed the metadata; False during a rotation."""
         here = self._keys_here(metadata.signed.type)
         return all(signer.public_key.keyid in metadata.signatures for signer in here)
 
     def _check_origin(self) -> None:
-        """Bring the first root to the store; it must be the one of these keys."""
+        """Write the first root to the store; an existing one must be the root of these keys."""
         number = Metadata[Root].from_bytes(self.trusted).signed.version
         path = metadata_path(Root.type, number)
         try:
@@ -369,7 +370,7 @@ class MapSigner:
     # --- entry and CURRENT ----------------------------------------------------------------------
 
     def _repair(self, current: Current, seen: CurrentState) -> None:
-        """Make entry and ``CURRENT`` say what is signed; what ``CURRENT`` says otherwise was never signed."""
+        """Make entry and ``CURRENT`` name the signed version; any other version there was never signed."""
         store = self._store
         try:
             is_right = read_entry(store, current.version).current == current
@@ -386,7 +387,7 @@ class MapSigner:
         put_over(store, CURRENT, pack_json(current), seen.tag)
 
     def _follow(self, current: Current) -> None:
-        """Make ``CURRENT`` name this version, unless a later one is signed already."""
+        """Make ``CURRENT`` name this version, unless it names a later one already."""
         for _ in range(_MAX_TRIES):
             seen = read_current(self._store)
             if seen.current is not None and seen.current.version >= current.version:
@@ -398,7 +399,7 @@ class MapSigner:
     # --- keys -----------------------------------------------------------------------------------
 
     def _make_keys(self) -> None:
-        """Make what is missing of the keys, and then the root of trust that names them."""
+        """Create missing keys, and then the root of trust that names them."""
         with writing_errors(self._directory):
             os.makedirs(self._directory, mode=0o700, exist_ok=True)
             for name in dict.fromkeys(_KEYS.values()):
@@ -416,13 +417,13 @@ class MapSigner:
                 with appearing_file(os.path.join(self._directory, ROOT_FILE), replace=False) as file:
                     file.write(metadata.to_bytes())
             except FileExistsError:
-                pass  # another run was quicker, with the same keys
+                pass  # another run with the same keys was quicker
 
     def _key_path(self, name: str) -> str:
         return os.path.join(self._directory, f"{name}.pem")
 
     def _next_key(self, name: str) -> CryptoSigner:
-        """Return the next key: that of a rotation that was killed, or a new one."""
+        """Return the next key: that of a killed rotation, or a new one."""
         path = self._key_path(f"{name}.next")
         with writing_errors(self._directory):
             if not os.path.lexists(path):
@@ -431,15 +432,15 @@ class MapSigner:
         return _read_key(self._directory, f"{name}.next")
 
     def _keys_here(self, role: str) -> list[CryptoSigner]:
-        """Keys of a role that are here and that the root names; in a rotation the old one and the next."""
+        """Return a role's local keys that the root names; during a rotation the old and the next one."""
         names = (_KEYS[role], f"{_KEYS[role]}.next")
         here = [_read_key(self._directory, name) for name in names if os.path.lexists(self._key_path(name))]
         return [signer for signer in here if signer.public_key.keyid in self._root.signed.roles[role].keyids]
 
     def _signers(self, role: str) -> list[CryptoSigner]:
-        """Return the keys that a role signs with, at least one."""
+        """Return the keys that a role signs with; raise an error if there are none."""
         if not (here := self._keys_here(role)):
-            _read_key(self._directory, _KEYS[role])  # says why, if it cannot be read
+            _read_key(self._directory, _KEYS[role])  # raises the reason if the key cannot be read
             raise ConfigError(
                 f"{self._key_path(_KEYS[role])} is not the key that the map's root of trust names for {role}",
                 hint="if that was rotated elsewhere, the new key belongs here",

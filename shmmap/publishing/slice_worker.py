@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A slice's worker: a process that makes layers of cells of a published map and sends their objects.
+"""Worker of a slice: a process that makes layers of a published map's cells and sends their objects.
 
 Points of the next cells are fetched while a cell is made.  Cells are made and sent as in
-`shmmap.publishing.worker`, which reads files.
+`shmmap.publishing.worker`, which reads files instead.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ from shmmap.segment.version import Source, Stamp
 __all__ = ["HELD_BYTES", "PublishedPoints", "main"]
 
 HELD_BYTES: Final = 128 << 20
-"""Fetched objects held in memory: the next cells look into some of the same neighbours."""
+"""Size limit of fetched objects held in memory, since the next cells use some of the same neighbours."""
 _OF_THE_STORE: Final = (Offline.code, MapMissing.code)
-"""Any other cell would fail in the same way: the run ends."""
+"""Errors of the store, which end the run because any other cell would fail in the same way."""
 
 
 class PublishedPoints:
@@ -57,9 +57,9 @@ class PublishedPoints:
     objects
         Reads objects, verified.
     threads
-        Fetch ahead.
+        Threads that fetch ahead.
     max_bytes
-        Most bytes of objects that are held in memory.
+        Size limit of objects held in memory.
     """
 
     fetcher = None
@@ -68,18 +68,18 @@ class PublishedPoints:
         self._objects = objects
         self._threads = threads
         self._max_bytes = max_bytes
-        self._held: OrderedDict[ObjectName, Future[memoryview]] = OrderedDict()  # the last used comes last
+        self._held: OrderedDict[ObjectName, Future[memoryview]] = OrderedDict()  # most recently used last
         self._bytes = 0
 
     def begin(self, sources: Sequence[Source]) -> None:
-        """Begin to fetch the points of cells while there is room; returns at once."""
+        """Begin to fetch the points of cells as far as memory allows, without waiting."""
         for source in sources:
             name = unpack_source(source)[LAYER].name
             if name not in self._held and self._bytes + name.size <= self._max_bytes:
                 self._hold(name)
 
     def stamp(self, source: Source) -> Stamp:
-        """Return the state that its objects are of: they never change."""
+        """Return the stamp in the source, whose objects never change."""
         return stamp_of(source)
 
     def read(self, source: Source, box: Box, needs: Sequence[str] | None) -> CellSource:
@@ -88,9 +88,9 @@ class PublishedPoints:
         Raises
         ------
         LoadFailed
-            They are damaged: a layer made without them would be another one.
+            The points are damaged.  A layer made without them would differ.
         Offline, MapMissing
-            They cannot be fetched.
+            The points cannot be fetched.
         """
         name = unpack_source(source)[LAYER].name
         identity = CellIdentity(source.name, box, "", self.stamp(source))
@@ -115,19 +115,19 @@ class PublishedPoints:
         reserve: Callable[[int], None] | None,
         warn: Callable[[str], None],
     ) -> None:
-        """None: each layer is computed."""
+        """Return None, as each layer is computed."""
         del spec, job, fd, reserve, warn
 
     def take_counts(self) -> tuple[int, ...]:
-        """Return nothing: what a slice read is not in statistics."""
+        """Return (), as a slice's reads are not in the statistics."""
         return ()
 
     def named(self, message: str) -> str:
-        """Return the message as it is: it names cells by their ids."""
+        """Return the message unchanged, as it already names cells by their ids."""
         return message
 
     def explain(self, source: Source, message: str) -> str:
-        """Return the message as it is."""
+        """Return the message unchanged."""
         del source
         return message
 
@@ -141,7 +141,7 @@ class PublishedPoints:
             self._bytes -= name.size
             if not isinstance(error, MapDataError):
                 raise
-            return self._objects.read(name.sha256, name.size)  # it may have been damaged on its way
+            return self._objects.read(name.sha256, name.size)  # retry, as the transfer may have damaged it
 
     def _hold(self, name: ObjectName) -> Future[memoryview]:
         held = self._held[name] = self._threads.submit(self._objects.read, name.sha256, name.size)
@@ -153,7 +153,7 @@ class PublishedPoints:
 
 
 class _Tasks:
-    """The tasks of a worker: tasks that have arrived are begun while the one before is made."""
+    """Tasks of a worker; ``begin`` is called for the next tasks while a task is being worked on."""
 
     def __init__(self, channel: socket.socket, begin: Callable[[CellTask], None]) -> None:
         self._channel = channel
@@ -171,7 +171,7 @@ class _Tasks:
             yield waiting.popleft()
 
     def _receive(self, *, wait: bool) -> bytes | None:
-        """Return the next packet; empty: the channel is closed; None: none has arrived yet."""
+        """Return the next packet; empty if the channel is closed, None if no packet has arrived yet."""
         try:
             return self._channel.recv(MAX_PACKET_BYTES, 0 if wait else socket.MSG_DONTWAIT)
         except BlockingIOError:
@@ -210,7 +210,7 @@ def _work(channel: socket.socket, argument: str) -> None:
 
 
 def _is_kept(task: CellTask, cache: LayerCache | None, points: PublishedPoints) -> bool:
-    """Whether all layers of a cell are in the cache: its points are then not needed."""
+    """Whether all layers of a cell are in the cache, so that its points are not needed."""
     if cache is None:
         return False
     keys = (

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Making one slice of a run: layers of a published map's cells are computed, sent, and listed in its part.
+"""Makes one slice of a run: computes and sends layers of a published map's cells, and lists them in its part.
 
-A slice needs no other slice: it reads the version, and those cells of other slices that its own look into.
-Made again, it gives the same bytes; what is already there is neither computed nor sent again.
+A slice does not depend on other slices: it reads the version, and the neighbours of its cells in other
+slices.  A slice made again gives the same bytes; objects that exist are neither computed nor sent again.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ from shmmap.segment.version import Source
 
 __all__ = ["BaseVersion", "Sliced", "changed_layers", "new_objects", "prepare_slice", "read_base"]
 
-_THERE_S: Final = 4 * 86_400.0  # most age of a slice that need not be made again; joining accepts six days
+_THERE_S: Final = 4 * 86_400.0  # maximum age of a slice that is not made again; joining accepts six days
 _SHARDS_HELD: Final = 16
 _STRIP_CELLS: Final = 4
 _MAX_TRIES: Final = 100
@@ -84,7 +84,7 @@ def read_base(store: Store, current: Current) -> BaseVersion:
 
 
 def changed_layers(before: Shard, after: Shard, allowed: Collection[str], *, name: str) -> list[str]:
-    """Return which layers of a shard are new or have changed.
+    """Return the layers of a shard that are new or have changed.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ def changed_layers(before: Shard, after: Shard, allowed: Collection[str], *, nam
     Raises
     ------
     MapDataError
-        Its cells or another layer differ (cause ``damaged``).
+        The shard's cells or a layer that is not allowed differ (cause ``damaged``).
     """
     same = before.names == after.names and _are_equal(before, after, ("boxes", "z", "points"))
     if not same:
@@ -114,7 +114,7 @@ def changed_layers(before: Shard, after: Shard, allowed: Collection[str], *, nam
 
 
 def new_objects(root: Root, number: int, shard: Shard, changed: Collection[str]) -> set[tuple[bytes, int]]:
-    """Hash and size of the objects of a shard's changed layers, and of the shard if there are any."""
+    """Return hash and size of the objects of a shard's changed layers, and of the shard if any changed."""
     if not changed:
         return set()
     found = {one for name in changed for one in shard.layers[name].objects()}
@@ -122,7 +122,7 @@ def new_objects(root: Root, number: int, shard: Shard, changed: Collection[str])
 
 
 def _are_equal(one: object, other: object, columns: Sequence[str]) -> bool:
-    """Whether columns have the same bytes; heights may be NaN."""
+    """Whether columns have the same bytes, which also works for NaN heights."""
     return all(getattr(one, column).tobytes() == getattr(other, column).tobytes() for column in columns)
 
 
@@ -133,15 +133,15 @@ class Sliced:
     Attributes
     ----------
     version
-        Number of the version that layers are added to.
+        Number of the version to which layers are added.
     layers
         Specs of the run's layers.
     there
-        It had been made before and is whole: nothing was done.
+        Whether the slice already existed complete, so that nothing was done.
     kept, made
         Layers of cells that the version already has; layers made now, those from the cache included.
     sent_objects, sent_bytes
-        What was sent, shards included.
+        Number and bytes of the objects that were sent, shards included.
     """
 
     version: int
@@ -170,20 +170,20 @@ def prepare_slice(
     workers: int,
     progress: PrepareProgress,
 ) -> Sliced:
-    """Make a slice: objects, shards and its part are in the store afterwards.
+    """Make a slice and send its objects, shards and part to the store.
 
     Parameters
     ----------
     layers
-        Specs, in any form; ``points`` are left out.
+        Specs of the layers, in any form; ``points`` is ignored.
     number, slices
-        Which slice of how many; the first is 1.
+        Number of the slice, from 1, and number of slices.
     settings
-        How workers open the store, and where they keep layers.
+        Settings by which workers open the store and keep layers.
     current
         The current version, if it was verified; None: the one in ``CURRENT``.
     workers
-        How many processes make layers.
+        Number of processes that make layers.
 
     Returns
     -------
@@ -192,7 +192,7 @@ def prepare_slice(
     Raises
     ------
     BadRequest
-        A layer is unknown, there is none, there is no such slice, or the store is read-only.
+        A layer is unknown, no layer or no valid slice is given, or the store is read-only.
     MapMissing, MapDataError, Offline, CannotWrite
         Nothing is published there, the map is damaged, the store does not answer or refuses, or the cache
         directory cannot be written.
@@ -215,7 +215,7 @@ def prepare_slice(
 
 @dataclass(slots=True)
 class _Making:
-    """A shard whose cells are being made; ``left`` counts those that are not done."""
+    """A shard whose cells are being made; ``left`` counts the cells that are not done."""
 
     shard: Shard
     objects: CellObjects
@@ -249,16 +249,16 @@ class _Cells(Catalogue):
         )
 
     def source(self, index: int) -> Source:
-        """Return the object of a cell's points."""
+        """Return the source of a cell: the object of its points."""
         shard, row = self._places[index]
         points = LayerSource(*shard.layers[POINTS].name(row), self._builder_version)
         return pack_source(self.id(index), {POINTS: points})
 
     def rows_of(self, shard: Shard) -> list[tuple[int, int]]:
-        """Index and row of each cell of one shard, so ordered that neighbours follow closely."""
+        """Return index and row of each cell of a shard, in an order that keeps neighbours close."""
         found = [(index, row) for index, (other, row) in enumerate(self._places) if other is shard]
         x, y = np.floor(shard.boxes[:, :2] / [size or 1.0 for size in self.mean_size]).T
-        strips = np.floor(x / _STRIP_CELLS)  # so a halo's cells are still held from the row before
+        strips = np.floor(x / _STRIP_CELLS)  # narrow enough that the previous row's cells are still held
         return sorted(found, key=lambda one: (strips[one[1]], y[one[1]], x[one[1]]))
 
 
@@ -324,7 +324,7 @@ class _Slice:
     # --- the part -------------------------------------------------------------------------------
 
     def _part_there(self, path: str) -> tuple[Part | None, Tag | None]:
-        """Return the part that was written before, None if there is no sound one; and the object's tag."""
+        """Return the existing part (None if there is no valid one) and the tag of its object."""
         tag = None
         try:
             frame, tag = self._store.get_tagged(path, MAX_PART_BYTES)
@@ -332,12 +332,12 @@ class _Slice:
         except MapMissing:
             return None, None
         except MapDataError:
-            if tag is None:  # it is too large to be one
+            if tag is None:  # the object is too large for a part
                 self._store.delete(path)
             return None, tag
 
     def _is_whole(self, part: Part) -> bool:
-        """Whether a part is what would be made now, and all objects that it names are there and recent."""
+        """Whether a part equals one made now, and all objects that it names exist and are recent."""
         if part.layers != self._layers:
             return False
         since_s = time() - _THERE_S
@@ -379,7 +379,7 @@ class _Slice:
             if put_over(self._store, path, data, tag):
                 step("slice.made")
                 return
-            tag = self._part_there(path)[1]  # another program has made the same slice meanwhile
+            tag = self._part_there(path)[1]  # another process has made the same slice meanwhile
         raise InstanceBusy(f"other programs keep writing {self._store.url}/{path}", hint="try again later")
 
     # --- cells ----------------------------------------------------------------------------------
@@ -403,7 +403,7 @@ class _Slice:
                 yield task
 
     def _around(self, number: int, shard: Shard) -> list[Shard]:
-        """Return a shard and those with cells that its own may look into."""
+        """Return a shard, and the shards with neighbours that its cells' layers may use."""
         if not self._halo_m:
             return [shard]
         low, high = shard.boxes[:, :2].min(axis=0), shard.boxes[:, 2:].max(axis=0)
@@ -453,7 +453,7 @@ class _Slice:
                 self._rows[number] = self._send_shard(making)
 
     def _number_of(self, task: CellTask) -> int:
-        """Return the number of the shard that a task's cell is in."""
+        """Return the number of the shard that contains a task's cell."""
         return int(np.searchsorted(self._first, task.number, side="right")) - 1
 
     def _send_shard(self, making: _Making) -> _ShardRow:

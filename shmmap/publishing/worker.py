@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A publishing worker: a process that makes the layers of one cell after the other and sends their objects.
+"""Publishing worker: a process that makes the layers of one cell after the other and sends their objects.
 
-Layers are made as `shmmap.prepare` and loaders make them.  While one cell is sent, the next is made.
+Layers are made as in `shmmap.prepare` and in loaders.  While one cell is sent, the next one is made.
 """
 
 from __future__ import annotations
@@ -69,10 +69,10 @@ _XYZ: Final = "xyz"
 
 
 class RoundedFiles(Files):
-    """A `shmmap.layers.sources.SourceReader`: rows and coordinates as a reader of the map has them."""
+    """Reader of files that gives points rounded and ordered, as readers of the published map see them."""
 
     def read(self, source: Source, box: Box, needs: Sequence[str] | None) -> CellSource:
-        """Read the file, its points rounded and in their new order."""
+        """Read the file, with its points rounded and in their published order."""
         found = super().read(source, box, None if needs is None else [_XYZ, *(n for n in needs if n != _XYZ)])
         table = found.points
         columns = {name: values for name, values in table.columns.items() if needs is None or name in needs}
@@ -87,7 +87,7 @@ class RoundedFiles(Files):
 
 @dataclass(frozen=True, slots=True)
 class _Layer:
-    """A layer's object; ``frame`` is None where the version before has it."""
+    """A layer's object; ``frame`` is None if the version before already has the object."""
 
     name: ObjectName
     frame: bytes | None
@@ -95,14 +95,14 @@ class _Layer:
 
 @dataclass(frozen=True, slots=True)
 class MadeCell:
-    """The objects of a cell's layers; ``points`` is the header of layer ``points``, None without it."""
+    """Objects of a cell's layers; ``points`` is the header of layer ``points``, None if it was not made."""
 
     points: SegmentHeader | None
     layers: tuple[_Layer, ...]
 
 
 class LayerRefused(Exception):
-    """A layer that cannot be made, and why."""
+    """Error for a layer that cannot be made, with the reason."""
 
     def __init__(self, layer: str, code: str, message: str, hint: str = "") -> None:
         super().__init__(message)
@@ -117,11 +117,11 @@ class CellMaker:
     known
         Objects that need not be made again.
     cache, keep
-        Where layers may already be, and whether to keep new ones there.
+        Cache that may already have layers, and whether to keep new ones in it.
     millimetres
         Round points to millimetres.
     reader
-        Reads the cells' points; None: they are files.
+        Reads the cells' points; None: from files.
     """
 
     def __init__(
@@ -135,12 +135,12 @@ class CellMaker:
     ) -> None:
         self._known = known
         self._millimetres = millimetres
-        self._cache = cache if not millimetres else None  # which was made of exact points
+        self._cache = cache if not millimetres else None  # the cache's layers are made of exact points
         self._keep = keep
         self._reader = reader or (RoundedFiles() if millimetres else FILES)
 
     def make(self, task: CellTask) -> MadeCell:
-        """Make the objects of a cell's layers; `LayerRefused` where one cannot be made."""
+        """Make the objects of a cell's layers; raise `LayerRefused` if a layer cannot be made."""
         specs = [layer_spec(name) for name in task.layers]
         source = CellPoints(task.source, task.box, specs, self._reader)
         layers, headers = [], []
@@ -190,7 +190,7 @@ class CellMaker:
         except MemoryError:
             message = f"{job.source.name}: building {name} ran out of memory"
             raise LayerRefused(name, MapDataError.code, message) from None
-        except Exception as error:  # noqa: BLE001  a builder of another package, say
+        except Exception as error:  # noqa: BLE001  a builder of another package may raise anything
             message = f"{job.source.name}: building {name} failed: {error!r}"
             raise LayerRefused(name, InternalError.code, message) from None
 
@@ -215,7 +215,7 @@ def _contents(fd: int, nbytes: int) -> memoryview:
 
 
 class Sender:
-    """Sends objects, in threads."""
+    """Sends objects to the store; thread-safe."""
 
     def __init__(self, store: Store, send: Callable[[CellSent | NotSent], None], *, is_first: bool) -> None:
         self._store = store
@@ -225,7 +225,7 @@ class Sender:
         self._there: set[bytes] = set()
 
     def send(self, number: int, cell: MadeCell) -> None:
-        """Send what is not there, and report it."""
+        """Send the objects of a cell that the store does not have, and report the cell."""
         try:
             layers = tuple(
                 LayerSent(*layer.name, self._sent(layer.name, layer.frame)) for layer in cell.layers
@@ -235,11 +235,11 @@ class Sender:
             self._send(CellSent(number, *described, layers))
         except ShmmapError as error:
             self._send(NotSent(number, "", error.code, error.message, error.hint))
-        except Exception as error:  # noqa: BLE001  reported, the run ends
+        except Exception as error:  # noqa: BLE001  reported, and then ends the run
             self._send(NotSent(number, "", InternalError.code, repr(error), ""))
 
     def refuse(self, why: NotSent) -> None:
-        """Report that a cell is not sent."""
+        """Report that a cell was not sent."""
         self._send(why)
 
     def _sent(self, name: ObjectName, frame: bytes | None) -> int:
@@ -276,12 +276,12 @@ def _work(channel: socket.socket, argument: str) -> None:
 def make_and_send(
     tasks: Iterable[CellTask], maker: CellMaker, sender: Sender, *, ending: Collection[str] = ()
 ) -> None:
-    """Make cells and send them in other threads, until there are no more tasks.
+    """Make cells, and send them in other threads, until there are no more tasks.
 
     Parameters
     ----------
     ending
-        Codes of errors that end the run: every other cell would meet them, too.
+        Codes of errors that end the run, because every other cell would fail with them, too.
     """
     with ThreadPoolExecutor(TASKS_AHEAD, "send") as pool:
 
@@ -299,7 +299,7 @@ def make_and_send(
 
 
 def run_worker(arguments: list[str], work: Callable[[socket.socket, str], None]) -> int:
-    """Run with ``CHANNEL_FD PARENT_PID SETTINGS``: ``work`` takes the channel and the settings."""
+    """Run ``work`` with the channel and settings given by ``CHANNEL_FD PARENT_PID SETTINGS``."""
     channel = channel_to_parent(arguments)
     os.nice(_NICENESS)
     with contextlib.suppress(BrokenPipeError, ConnectionResetError):

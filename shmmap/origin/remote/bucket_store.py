@@ -119,7 +119,7 @@ class BucketStore:
         return memoryview(data), tag
 
     def head(self, path: str) -> Listed | None:
-        """Return an object's size and age."""
+        """Return an object's size and time of writing; None if it does not exist."""
         try:
             meta = self._ask(path, lambda: obstore.head(self._store, path))
         except MapMissing:

@@ -163,7 +163,7 @@ class ObjectTier:
             self._budget.trim()
 
     def mark_index_used(self, digests: Iterable[bytes]) -> None:
-        """Mark the index pages of the version in use, which are evicted last."""
+        """Mark the index pages of the version in use as recently used, so that they are evicted later."""
         with contextlib.suppress(OSError), self._opened() as place:
             for digest in digests:
                 with contextlib.suppress(OSError):
@@ -219,7 +219,7 @@ def _path(digest: bytes, is_index: bool) -> str:
 
 
 def _read(place: int, path: str, nbytes: int) -> bytes:
-    """Read a file of ``nbytes`` bytes without blocking; any other file gives bytes with another hash."""
+    """Read a regular file of ``nbytes`` bytes without blocking; any other file gives empty bytes."""
     fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK, dir_fd=place)
     try:
         status = os.fstat(fd)

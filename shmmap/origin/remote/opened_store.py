@@ -143,7 +143,7 @@ class DirectoryStore:
         return None if found[1] == tag else found
 
     def head(self, path: str) -> Listed | None:
-        """Return a file's size and age."""
+        """Return a file's size and time of writing; None if it does not exist."""
         try:
             status = os.stat(self._path(path))
         except OSError as error:

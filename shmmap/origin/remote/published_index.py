@@ -442,11 +442,11 @@ class Shard:
         return len(self.names)
 
     def id(self, row: int, id_prefix: str) -> str:
-        """Id of a cell."""
+        """Return the id of a cell."""
         return id_prefix + self.names[row].decode()
 
     def box(self, row: int) -> Box:
-        """``min_x, min_y, max_x, max_y`` of a cell, metres, map frame."""
+        """Return ``min_x, min_y, max_x, max_y`` of a cell, metres, map frame."""
         min_x, min_y, max_x, max_y = self.boxes[row].tolist()
         return min_x, min_y, max_x, max_y
 
@@ -455,7 +455,7 @@ class Shard:
         return self.layers[POINTS].contents[row, :STAMP_BYTES].tobytes()
 
     def version(self, row: int, id_prefix: str) -> int:
-        """Version of a cell."""
+        """Return the version of a cell."""
         return cell_version(self.id(row, id_prefix), self.stamp(row), self.box(row))
 
     def identity(self, row: int, root: Root) -> CellIdentity:

@@ -296,7 +296,7 @@ def write_segment(
     name
         Name of the object, for messages.
     reserve
-        Called with the segment's size in bytes before anything is written; it refuses by raising.
+        Called with the segment's size in bytes before anything is written; raises to refuse it.
 
     Returns
     -------
