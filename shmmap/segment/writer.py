@@ -40,7 +40,8 @@ __all__ = [
 
 
 PIECE_BYTES: Final = 1 << 16
-"""Bytes per write, about 30 us: between writes other work may run on this processor.  Otherwise a client just woken by its reply would wait until the loader on the same processor blocks."""
+"""Bytes per write, about 30 us: between writes other work may run on this processor.  Otherwise a client just
+woken by its reply would wait until the loader on the same processor blocks."""
 
 
 def write_all(fd: int, data: memoryview, offset: int) -> None:
