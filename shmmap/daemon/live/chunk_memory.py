@@ -295,7 +295,7 @@ class ChunkMemory:
                     self.foreign.add(name)
 
     def _is_ours(self, name: str) -> bool:
-        """Whether a file belongs to this process's user; in a sticky directory no other can replace it."""
+        """Return whether this user owns a file; in a sticky directory no other user can replace it."""
         try:
             return os.stat(name, dir_fd=self._fd, follow_symlinks=False).st_uid == os.geteuid()
         except FileNotFoundError:

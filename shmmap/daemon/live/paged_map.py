@@ -263,7 +263,7 @@ class PagedMap:
         return len(self.chunks)
 
     def _left_behind(self, name: str) -> ChunkFile | None:
-        """Open a chunk of this map; return None if it is none, raise OSError if it cannot be opened now."""
+        """Open a chunk of this map; return None if it is invalid, raise OSError if it cannot be opened."""
         if self.memory.is_given_up(name):
             return None
         try:

@@ -244,7 +244,7 @@ class MapFiles:
     # --- the start ------------------------------------------------------------------------------
 
     def _header(self, name: str, *, whole: bool = False) -> ChunkFileHeader | None:
-        """Return the header of a file of this map, if its length is right, and, if ``whole``, its body."""
+        """Return the header of a file of this map; None if its length (``whole``: its body) is wrong."""
         with contextlib.suppress(FileNotFoundError, MapDataError):
             header = (
                 check_file(read_chunk(self.files, name), name) if whole else read_header(self.files, name)

@@ -41,7 +41,7 @@ CHUNKS_PER_CHANGE: Final = 32
 SAVE_CANDIDATES: Final = 32
 """How many of the chunks changed longest ago are searched for an unwanted one."""
 FOUND_PER_REVIEW: Final = 64, 16
-"""How many chunks one review finds: at least the first, or one in the second; their order gets old."""
+"""How many chunks one review selects: at least the first number, or one in the second."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,14 +230,14 @@ class Residency:
         self._fruitless_s = dict.fromkeys(self._found, -math.inf)
 
     def is_wanted(self, chunk: Chunk, now_s: float) -> bool:
-        """Whether a chunk should stay: a scan waits for it, it is near a client, or it was just changed."""
+        """Return whether a chunk should stay: a scan needs it, a client is near, or it was just changed."""
         near = chunk.key in self.windows.near
         return near or bool(chunk.waiting) or now_s < chunk.changed_s + self.limits.linger_s
 
     # --- scans ----------------------------------------------------------------------------------
 
     def has_room(self, nbytes: int) -> bool:
-        """Whether another scan is accepted: what waits is bounded, and a single one may always wait."""
+        """Return whether another scan is accepted: waiting scans are bounded, but one may always wait."""
         return not self.waiting_bytes or self.waiting_bytes + nbytes <= self.limits.waiting_bytes
 
     def add(self, scan: Scan) -> None:
@@ -413,7 +413,7 @@ class Residency:
         return None
 
     def _has_clean(self, rank: _Rank, now_s: float, short: _Short) -> bool:
-        """Whether a clean chunk is given up before one of this rank, which then need not be saved."""
+        """Return whether a clean chunk is evicted before one of this rank, which then need not be saved."""
         found = self._found[State.CLEAN]
         return (
             bool(found)

@@ -99,7 +99,7 @@ class Windows:
         return count == 1
 
     def _leave(self, center: ChunkKey, now: ChunkKey | None) -> list[ChunkKey]:
-        """Count one window less around a chunk, but not around another; return what is near none any more."""
+        """Remove a window around a chunk, except around ``now``; return chunks near no client any more."""
         left = []
         for key in self._only_around(center, now):
             self.near[key] -= 1

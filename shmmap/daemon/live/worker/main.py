@@ -98,7 +98,7 @@ class _Worker:
         return sum(len(one.live.chunks) for one in self._maps.values())
 
     def _refusal(self) -> tuple[str, str, str]:
-        """Return why no map can be served until the settings change; empty if that may pass by itself."""
+        """Return why no map can be served with these settings; empty if the problem may be temporary."""
         errors = [one.error for one in self._opening.values()]
         refused = [one for one in errors if isinstance(one, ConfigError | InstanceBusy)]
         if self._maps or len(refused) < len(errors) or not refused:
@@ -257,7 +257,7 @@ class _Worker:
         return ending.keep or all(now_s > max(one.live.saved_s, self._ending_s) + HOPELESS_S for one in left)
 
     def end(self, ending: messages.End) -> tuple[messages.Unsaved, ...]:
-        """Leave memory as it is, or empty it; return what stays because it is nowhere else."""
+        """Close all maps, keeping or freeing their memory; return the unsaved chunks, which stay."""
         unsaved = []
         for name, one in self._maps.items():
             if chunks := one.end(keep=ending.keep):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A live map whose files are being read: in a thread, since a directory may hang, until it succeeds.
+"""Open a live map: a thread reads its files, since a directory may hang, and retries on errors.
 
 A problem with one map's files is reported, and does not affect other maps.
 """
@@ -56,7 +56,7 @@ class OpeningMap:
         self._outcome: list[tuple[Folder, MapFiles] | Exception] = []
 
     def run_turn(self, now_s: float) -> tuple[Folder, MapFiles] | None:
-        """Continue; return the open directory and its files, in a new run, once they have been read."""
+        """Continue; once the files are read, begin a new run and return the open directory and the files."""
         if self._thread is None:
             if now_s >= self._retry_s:
                 self._begun_s = now_s

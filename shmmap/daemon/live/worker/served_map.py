@@ -94,12 +94,12 @@ class ServedMap:
         self.readers = Readers(self.live, self.changes, answer, wake)
         self._marks = marks
         self._answer = answer
-        self._tickets: dict[tuple[int, int], list[tuple[int, int]]] = {}  # of scans that are not applied yet
+        self._tickets: dict[tuple[int, int], list[tuple[int, int]]] = {}  # of scans not applied yet
         self._waiting: deque[tuple[Ask, messages.LiveScan]] = deque()
         self._saves: list[tuple[Ask, messages.LiveSave, list[tuple[Chunk, int]]]] = []
         self._places: dict[int, _Place] = {}
         self._writing: dict[int, int] = {}  # sessions by ticket whose requests wait for the disk
-        self._adopted: list[tuple[Chunk, int]] = []  # what a previous run applied, and is not durable yet
+        self._adopted: list[tuple[Chunk, int]] = []  # applied by a previous run, not durable yet
         self._scans = self._durable = 0
         self._marks_bytes = 0  # size of marks in shared memory when last counted
         self._file_bytes, self._files_s = 0, -math.inf
