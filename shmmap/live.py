@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Live maps: made while driving, by processes that write them, for those that read them (``LIVE_MAPS.md``).
+"""Live maps: maps that some processes write while driving and others read (``LIVE_MAPS.md``).
 
 `shmmap.Client.live` returns a `LiveMap`; `LiveMap.mapper` the `LiveMapper` that scans are inserted with.
 

@@ -28,7 +28,7 @@ __all__ = ["KINDS", "read_chunk", "select_voxels", "sequence_of"]
 
 KINDS: Final = ("occupied", "free")
 TRIES: Final = 1000
-"""A writer takes 40 us for a chunk; one that died meanwhile leaves the sequence odd until the next comes."""
+"""Tries for one copy: a write takes 40 us, but after a writer's death the sequence may stay odd."""
 
 _SEQUENCE: Final = struct.Struct("<Q")
 _MEMBARRIER: Final = {"aarch64": 283, "riscv64": 283, "armv7l": 389, "ppc64le": 365}

@@ -334,7 +334,7 @@ class StatisticsWriter:
         """Write at most ``max_rows`` changed rows, between two beats."""
         if not (self._changed or self._removed or self._missing or self._table_sequence % 2):
             return
-        if not self._mark_table(self._table_sequence + 1 | 1):  # odd already where no even one could follow
+        if not self._mark_table(self._table_sequence + 1 | 1):  # already odd after a failed write
             return
         for _ in range(min(max_rows, len(self._removed))):
             if not self._write_row(self._removed[-1], FREE_ROW):
