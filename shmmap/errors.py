@@ -4,10 +4,10 @@
 ::
 
     ShmmapError
-    ├── ConfigError            a setting is wrong (key, where it came from)       exit 78
-    ├── BadRequest             an argument or a message makes no sense            exit 2
+    ├── ConfigError            a setting is wrong (key, and its origin)           exit 78
+    ├── BadRequest             an argument or a message is invalid                exit 2
     │   └── NoColumn           a layer has no such column; also a `KeyError`
-    ├── MapDataError           a file is not what it claims to be                 exit 65
+    ├── MapDataError           a file is damaged or invalid                       exit 65
     ├── MapMissing             there is no map there                              exit 66
     ├── CannotWrite            an output cannot be made: disk full, no permission exit 73
     ├── DaemonUnreachable      no daemon answers                                  exit 69

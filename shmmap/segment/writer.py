@@ -63,7 +63,7 @@ class SegmentWriter:
     rows
         Exact number of rows of every column.
     cell_id, layer, box, frame_id
-        What the segment describes.
+        The cell, layer, box and frame that the segment contains.
 
     Attributes
     ----------

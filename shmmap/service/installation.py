@@ -295,7 +295,7 @@ def shipped_text(name: str) -> str:
     Raises
     ------
     BadRequest
-        There is no file of this name; the hint lists those there are.
+        There is no file of this name; the hint lists the existing ones.
     """
     if name not in shipped_names():
         raise BadRequest(f"there is no file {name!r}", hint="there are: " + ", ".join(shipped_names()))

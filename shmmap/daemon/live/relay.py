@@ -221,7 +221,7 @@ class NoLiveMaps:
 
     @property
     def next_s(self) -> float:
-        """Return infinity: nothing is ever due."""
+        """Infinity: nothing is ever due."""
         return math.inf
 
     def run_step(self, now_s: float) -> None:
@@ -232,7 +232,7 @@ class NoLiveMaps:
 
     @property
     def unsaved(self) -> dict[str, int]:
-        """Return an empty dict: nothing is unsaved."""
+        """Empty: nothing is unsaved."""
         return {}
 
 
@@ -399,7 +399,7 @@ class LiveRelay:
         self._failures += 1
         log.error("live worker ended", restarts=self.restarts)
         self._events.ended(self.restarts)
-        if self._failures > 1:  # once is hardly noticed: the next one finds what was in memory
+        if self._failures > 1:  # a single failure is harmless: chunks stay in memory
             self._show_problem("the process of the live maps keeps ending: see the log")
         self._tickets.lose()
 

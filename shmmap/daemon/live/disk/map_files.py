@@ -6,9 +6,9 @@
   no death of a process loses it, and its memory may be freed.  `MapFiles.flush` brings it to the disk, then
   into the place of an older one, and then it is *durable*.  Until then its bytes are kept, in case the disk
   fails, and for the next load: a file that is written often is flushed seldom.
-- ``manifest.json`` lists the durable chunks.  It is written last, and only shows what was removed since; all
-  else is read from the chunks' headers.
-- A damaged file is quarantined as ``3_-1_0.chunk.damaged.1``, reported, and never overwritten.  A file that
+- ``manifest.json`` lists the durable chunks.  It is written last, and only serves to detect chunks removed
+since; all other data is read from the chunks' headers. - A damaged file is quarantined as
+``3_-1_0.chunk.damaged.1``, reported, and never overwritten.  A file that
   the system does not let this process read may be good: then the map cannot be opened, and nothing changes.
 """
 
@@ -111,17 +111,17 @@ class MapFiles:
 
     @property
     def map_id(self) -> bytes:
-        """Return 16 bytes that no other map has."""
+        """Unique id of the map, 16 bytes."""
         return bytes.fromhex(self._map.map_id)
 
     @property
     def settings(self) -> MapSettings:
-        """Return the settings that were fixed when the map was created."""
+        """Settings that were fixed when the map was created."""
         return self._map.settings
 
     @property
     def mappers(self) -> list[Mapper]:
-        """Return all mappers, the oldest first."""
+        """All mappers, the oldest first."""
         return self._map.mappers
 
     def begin_run(self) -> int:
@@ -224,7 +224,7 @@ class MapFiles:
 
     @property
     def unflushed_bytes(self) -> int:
-        """Return the memory of the files that are written but not durable yet, bytes."""
+        """Memory of the files that are written but not durable yet, bytes."""
         return self._unflushed.nbytes
 
     def remove_spare(self) -> None:

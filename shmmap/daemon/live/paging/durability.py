@@ -74,7 +74,7 @@ class Chunk:
     in_progress
         The chunk is being loaded.
     leaving
-        It is being saved in order to be given up.
+        The chunk is being saved before its eviction.
     retry_s
         Its file is not retried before this time.
     missing_bytes

@@ -260,7 +260,7 @@ class Residency:
 
     @property
     def is_ready(self) -> bool:
-        """Return whether a scan can be applied now, for which there may be memory."""
+        """Whether a scan can be applied now, for which there may be memory."""
         needing = self._needing.values()
         return any(one.state is not State.LOADING and not self._lacks_memory(one) for one in needing)
 

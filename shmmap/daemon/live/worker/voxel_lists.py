@@ -63,7 +63,7 @@ class Later:
 Steps = Generator[Callable[[], Any] | Later | None, Any, Any]
 """A request in progress: yields None after a step, `Later`, or a function for a thread, and gets its outcome.
 
-What it returns is the reply.
+It returns the reply.
 """
 
 
