@@ -37,7 +37,7 @@ def logfmt(event: str, **details: object) -> str:
     Parameters
     ----------
     event
-        What happened, in words that are always the same.
+        The event, in constant words without details.
     **details
         Written in this order; floats to three decimals, None is left out, and a value is quoted where
         it has blanks, quotes, ``=`` or characters that are not printable, or is empty.

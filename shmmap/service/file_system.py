@@ -88,7 +88,7 @@ class FileSystem:
     def outside(self, path: str) -> Path:
         """Return the path for this process of a path inside, with links in its directory resolved.
 
-        Its last name is not resolved: a link there is returned itself.
+        The path's last name is not resolved: if it is a link, the result is the link itself.
         """
         directory, name = os.path.split(path)
         return Path(os.path.normpath(f"{self.root}/{self.resolve(directory)}/{name}"))

@@ -24,7 +24,7 @@ def place_ahead(before: Place, here: Place, passed_s: float, ahead_s: float, lon
     Parameters
     ----------
     before, here
-        Its previous place, and its place now.
+        The client's previous and present place.
     passed_s, ahead_s
         Seconds between the two places, and seconds to look ahead.
     longest
