@@ -17,7 +17,7 @@ Ask
     `connect`, `Client`       a session with the daemon: `around`, `area`, `selected`, `differential`
     `Circle`, `Box`           areas; `AutowareSquare` is Autoware's area test; `Area` any of them
     `Cell`, `CellSet`         a cell: columns over shared memory; the cells that answer a request
-    `PendingLayer`            what of a `CellSet` is still being loaded
+    `PendingLayer`            a layer of a `CellSet` that is still being loaded
     `PointsAround`            the points in a circle, as views of the cells that they lie in
     `MapListing`, `CellInfo`  the cells that the map has, loaded or not
     ========================  ==================================================================
@@ -25,9 +25,9 @@ Ask
 Follow
     ========================  ==================================================================
     `MapWindow`               the cells around a moving pose, kept current by a thread
-    `WindowUpdate`            what a move has changed
-    `Retention`               what a window keeps attached of what it has left; a policy of one's own
-                              is a `RetentionPolicy`, which judges `RetentionCandidate`
+    `WindowUpdate`            the changes after a move
+    `Retention`               which cells outside a window stay attached; a custom policy is a
+                              `RetentionPolicy`, which decides about each `RetentionCandidate`
     ========================  ==================================================================
 
 Files
@@ -37,16 +37,16 @@ Files
     ========================  ==================================================================
 
 Errors
-    Every error is a `ShmmapError`: `BadRequest` (an argument makes no sense), `DaemonUnreachable` and
+    Every error is a `ShmmapError`: `BadRequest` (an argument is invalid), `DaemonUnreachable` and
     `NoAnswer`, `CellError` (`UnknownCell`, `LoadFailed`, `LoadTimeout`, `Offline`), `StaleHandle`,
-    `LimitReached`, `NotPermitted`, `MapDataError`; the whole tree is `shmmap.errors`.  What is less than was
-    asked for is a `ShmmapWarning`.
+    `LimitReached`, `NotPermitted`, `MapDataError`; the whole tree is `shmmap.errors`.  An incomplete result
+    is a `ShmmapWarning`.
 
 More
-    `shmmap.layers` (layers without a daemon, kinds of one's own), `shmmap.live` (live maps),
-    `shmmap.events` (what happens in the daemon), `shmmap.testing` (a daemon for tests).
+    `shmmap.layers` (layers without a daemon, custom kinds), `shmmap.live` (live maps),
+    `shmmap.events` (events of the daemon), `shmmap.testing` (a daemon for tests).
 
-Every name is loaded when it is first used, so that ``import shmmap`` itself costs next to nothing.
+Every name is loaded at its first use, so that ``import shmmap`` itself takes almost no time.
 """
 
 from __future__ import annotations
@@ -96,13 +96,13 @@ if TYPE_CHECKING:  # the list of public names
     from shmmap.geometry import Circle as Circle
 
 _PACKAGES: Final = ("errors", "events", "layers", "live")
-"""Where the other public names are."""
+"""Modules with the other public names."""
 
-# No `__all__`: of its classes `help(shmmap)` would print all that they have, seven thousand lines.
+# No `__all__`: with it, `help(shmmap)` would print the whole help of every class, seven thousand lines.
 _load = lazy_public_names(__name__)
 
 
-if not TYPE_CHECKING:  # for a type checker a name that is not in the list is no name
+if not TYPE_CHECKING:  # type checkers report names that are not in the list
 
     def __getattr__(name: str) -> Any:
         if name in _PACKAGES:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a table of points is made of: named columns, each with its dtype, width and unit; and its bounds."""
+"""Columns of a table of points, each with name, dtype, width and unit; and the bounds of points."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ class ColumnSpec:
 
     @property
     def row_bytes(self) -> int:
-        """Bytes of one row."""
+        """Size of one row, bytes."""
         return self.dtype.itemsize * self.components
 
 
 def column_names(names: Iterable[str]) -> tuple[str, ...]:
-    """Return names for columns beside ``xyz``: printable words, each once, and none that PCD reserves.
+    """Return unique, printable names for columns beside ``xyz``, without names that PCD reserves.
 
     White space and unprintable characters become underscores; a name that is in use gets a number.
     """
@@ -82,14 +82,14 @@ def _reduce(extreme: np.ufunc, rows: NDArray[Any]) -> list[float]:
 class Bounds:
     """Bounds of all finite points seen so far, float64, metres.
 
-    The minimum and maximum of a block are needed anyway, and they show whether every coordinate is
-    finite: both propagate NaN, and an infinity is one of them.  Only a block in which they are not
-    finite pays for a mask.
+    The minimum and maximum of a block are needed anyway, and they show whether every coordinate is finite:
+    both propagate NaN, and an infinity is itself an extreme.  Only a block with non-finite extremes needs a
+    mask.
 
     Attributes
     ----------
     low, high
-        Least and greatest x, y, z; infinite, the wrong way round, before any point.
+        Minimum and maximum x, y, z; +infinity and -infinity before the first point.
     """
 
     def __init__(self) -> None:
@@ -97,11 +97,11 @@ class Bounds:
         self.high = [-math.inf] * 3
 
     def add(self, xyz: NDArray[Any], axes: tuple[NDArray[Any], ...] = ()) -> NDArray[np.bool_] | None:
-        """Take a block of (N, 3) points in; ``axes`` are the same as contiguous x, y and z, if at hand.
+        """Add a block of (N, 3) points; ``axes`` are the same as contiguous x, y and z, if available.
 
         Returns
         -------
-        None if all are finite; else the mask of those that are, the only ones taken in.
+        None if all points are finite; else the mask of the finite points, which alone are added.
         """
         if not len(xyz):
             return None

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numba kernels: compiled for given types when their module is imported, and kept on disk.
+"""Compile Numba kernels for given types when their module is imported, and keep them on disk.
 
-Kernels live in modules of their own that are imported where they are needed, so that nothing else pays for
-numba.  Every signature takes read-only arrays (writable ones fit it too; the reverse would compile once
-more, for seconds, on the first array out of shared memory).
+Kernels are in separate modules that are imported only where needed, so that other code does not load numba.
+Every signature takes read-only arrays, which accepts writable ones, too.  (With writable signatures, the
+first array from shared memory would trigger another compilation of some seconds.)
 
-`shmmap.kernel_cache` has the files.  Numba's own cache is not used: it trusts whatever is in its files.
+`shmmap.kernel_cache` keeps the files.  Numba's own cache is not used, since it trusts its files unchecked.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ _dumps: Any = numba.core.serialize.dumps
 
 
 class _KernelFiles(NullCache):
-    """What a dispatcher of numba asks for compiled variants of its function, and gives them to.
+    """Cache interface for a dispatcher of numba: loads and stores compiled variants of its function.
 
     Parameters
     ----------
     function
-        In Python.
+        The Python function.
     source
-        Bytes of the file it is in.
+        Content of the function's source file.
     """
 
     def __init__(self, function: Callable[..., Any], source: bytes) -> None:
@@ -55,25 +55,25 @@ class _KernelFiles(NullCache):
         self._where = f"{code.co_filename} {function.__qualname__} {sys.implementation.cache_tag}"
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return the variant for a signature; None where it has to be compiled."""
+        """Return the compiled variant for a signature; None if it has to be compiled."""
         target_context.refresh()
         name = self._name(sig, target_context.codegen())
         data = read_kernel(name, self._made_from)
         if data is None:
             return None
         try:
-            return _CompileResult._rebuild(target_context, *pickle.loads(data))  # noqa: S301  it was checked whose it is
-        except Exception as error:  # noqa: BLE001  whatever is wrong with it, it can be compiled
+            return _CompileResult._rebuild(target_context, *pickle.loads(data))  # noqa: S301  its owner was checked
+        except Exception as error:  # noqa: BLE001  after any error the kernel can be compiled
             discard(name, error)
             return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Keep a variant, unless it is bound to this process."""
+        """Store a variant, unless it is bound to this process."""
         if not data.library.has_dynamic_globals and not data.lifted:
             write_kernel(self._name(sig, data.codegen), self._made_from, _dumps(data._reduce()))
 
     def _name(self, signature: Any, codegen: Any) -> str:
-        """Name of a file: another signature, processor or place of the source is another file."""
+        """Return a file's name, unique for the signature, the processor and the source's path."""
         key = f"{self._where} {signature} {codegen.magic_tuple()}"
         return f"{self._stem}.{hashlib.sha256(key.encode()).hexdigest()[:16]}.kernel"
 
@@ -86,7 +86,7 @@ def read_only(dtype: Any, dimensions: int) -> Any:
 def compiled(*signatures: Any, brief: bool = False, **settings: Any) -> Callable[[F], F]:
     """Compile a kernel for these signatures now; it runs without the interpreter lock.
 
-    A ``brief`` kernel keeps it: among other threads, getting the lock back takes longer than the kernel.
+    A ``brief`` kernel keeps the lock: among other threads, regaining it takes longer than the kernel.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def compiled(*signatures: Any, brief: bool = False, **settings: Any) -> Callable
         try:
             source = Path(function.__code__.co_filename).read_bytes()
         except OSError:
-            pass  # without its source it is not known whether what was kept is still right
+            pass  # without its source, stored variants cannot be checked
         else:
             kernel._cache = _KernelFiles(function, source)
         with register_dispatcher(kernel):

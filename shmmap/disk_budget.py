@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One budget for all that is kept in a cache directory: computed layers, and objects of published maps.
+"""Disk budget of a cache directory with computed layers and objects of published maps.
 
 ::
 
@@ -7,10 +7,10 @@
     DIRECTORY/objects/cells/ab/<sha256>    objects of shmmap.origin.remote.object_tier
     DIRECTORY/objects/index/ab/<sha256>    its index pages
 
-Any number of processes use it at once, and none of them is in charge.  Each counts what it adds, and looks
-through the directory now and then: where there is too much, the files used least recently are removed until
-a sixteenth of the budget is free.  Index pages go last, as long as they are at most a quarter of the budget:
-without them no cell is found, however many are there.
+Any number of processes may use the directory, without a coordinator.  Each process counts the bytes that it
+adds, and scans the directory at intervals.  If the budget is exceeded, it removes the least recently used
+files until a sixteenth of the budget is free.  Index pages are removed last, as long as they are at most a
+quarter of the budget: without them no cached cell can be found.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ OBJECTS: Final = "objects"
 CELLS: Final = "cells"
 INDEX: Final = "index"
 INTERIM: Final = ".new-"
-"""What the name of a file begins with until it is whole."""
+"""Prefix of a file's name until the file is complete."""
 
 _KEPT: Final = re.compile(r".+\.layer|[0-9a-f]{64}")
-_SPARE_SHARE: Final = 0.05  # of the file system: left free
+_SPARE_SHARE: Final = 0.05  # share of the file system that is left free
 _FREED_SHARE: Final = 1 / 16
-_STEPS: Final = 64  # parts of the budget: one may be added before a process looks again
-_PROCESSES: Final = 8  # that may add at the same rate
+_STEPS: Final = 64  # parts of the budget; a process scans again after adding one part
+_PROCESSES: Final = 8  # assumed number of processes that add at the same rate
 _INDEX_SHARE: Final = 1 / 4
 _USED_AGAIN_S: Final = 600.0
 _STALE_INTERIM_S: Final = 3600.0
@@ -57,16 +57,16 @@ class _Kept:
 
 
 class DiskBudget:
-    """Keeps what lies in one cache directory under one budget; may be used in threads.
+    """Keeps the files of one cache directory within a budget; thread-safe.
 
     Parameters
     ----------
     directory
         The cache directory.
     limit_bytes
-        Most bytes of all files that are kept in it.
+        Maximum total size of the files, bytes.
     owner
-        Whose objects they are; None: this process's user.
+        User id that owns the objects; None: this process's user.
     """
 
     def __init__(self, directory: str, limit_bytes: int, *, owner: int | None = None) -> None:
@@ -78,19 +78,19 @@ class DiskBudget:
         self._left_bytes = limit_bytes
 
     def has_room(self, nbytes: int) -> bool:
-        """Whether a file of this size may be added: some of the file system is left free.
+        """Return whether a file of this size may be added, leaving some of the file system free.
 
         Raises
         ------
         OSError
-            The directory cannot be looked at.
+            The directory cannot be examined.
         """
         room = os.statvfs(self.directory)
         spare = int(room.f_blocks * room.f_frsize * _SPARE_SHARE)
         return nbytes <= min(self.limit_bytes, room.f_bavail * room.f_frsize - spare)
 
     def added(self, nbytes: int) -> bool:
-        """Count a file that was added; True when it is time to `trim`."""
+        """Count an added file; return True when it is time to `trim`."""
         with self._lock:
             self._added_bytes += nbytes
             free_bytes = self.limit_bytes - self._left_bytes
@@ -100,14 +100,14 @@ class DiskBudget:
         return True
 
     def used_bytes(self) -> int:
-        """Bytes of all files that are kept, looked at now."""
+        """Return the present total size of the files, bytes."""
         return sum(kept.nbytes for kept in self._kept(remove_stale=False))
 
     def trim(self) -> int:
-        """Remove files if there are more than the budget allows; returns the bytes of what is left.
+        """Remove files if they exceed the budget; return the size of the remaining files, bytes.
 
-        A hundred thousand files take a second.  What a killed process left half written goes too, an hour
-        later.
+        A hundred thousand files take a second.  Incomplete files of killed processes are removed after an
+        hour.
         """
         found = self._kept(remove_stale=True)
         total = sum(kept.nbytes for kept in found)
@@ -146,7 +146,7 @@ class DiskBudget:
         return list(found.values())
 
     def _places(self) -> list[tuple[str, bool]]:
-        """Where files are kept, and whether they are index pages there."""
+        """Return the directories with files, and whether each contains index pages."""
         layers, objects = (os.path.join(self.directory, name) for name in (LAYERS, OBJECTS))
         places = [(layers, False)]
         with contextlib.suppress(OSError):
@@ -157,7 +157,7 @@ class DiskBudget:
 
 
 def _files(place: str) -> Iterator[os.DirEntry[str]]:
-    """All files below a directory; links are not followed, the directory may be one that is not there."""
+    """Yield all files below a directory, which may be missing; links are not followed."""
     with contextlib.suppress(OSError):
         if not stat.S_ISDIR(os.lstat(place).st_mode):
             return
@@ -170,7 +170,7 @@ def _files(place: str) -> Iterator[os.DirEntry[str]]:
 
 
 def _order_of_removal(found: list[_Kept], limit_bytes: int) -> list[_Kept]:
-    """Sort the least recently used first, then the index pages that are kept longest."""
+    """Sort files for removal: least recently used first, protected index pages last."""
     found.sort(key=lambda kept: kept.used_s)
     index_bytes = 0
     last: set[int] = set()
@@ -182,15 +182,15 @@ def _order_of_removal(found: list[_Kept], limit_bytes: int) -> list[_Kept]:
 
 
 def mark_used(fd: int, status: os.stat_result) -> None:
-    """Mark a file as used now; costs nothing if that was done within the last minutes."""
-    # a clock that was ahead by a day leaves stamps that are ahead
+    """Mark a file as used now; does nothing if it was marked within the last minutes."""
+    # a clock that was a day fast leaves stamps in the future
     if abs(time.time() - status.st_mtime) > _USED_AGAIN_S:
         with contextlib.suppress(OSError):
             os.utime(fd)
 
 
 def why_not_private(status: os.stat_result, uid: int) -> str:
-    """Why a directory is not an account's alone, as the end of a sentence; empty if it is."""
+    """Return why a directory is not private to a user, as the end of a sentence; empty if it is."""
     if stat.S_ISLNK(status.st_mode):
         return "is a symbolic link"
     if not stat.S_ISDIR(status.st_mode):

@@ -4,10 +4,10 @@
 ::
 
     ShmmapError
-    ├── ConfigError            a setting is wrong (key, where it came from)       exit 78
-    ├── BadRequest             an argument or a message makes no sense            exit 2
+    ├── ConfigError            a setting is wrong (key, and its origin)           exit 78
+    ├── BadRequest             an argument or a message is invalid                exit 2
     │   └── NoColumn           a layer has no such column; also a `KeyError`
-    ├── MapDataError           a file is not what it claims to be                 exit 65
+    ├── MapDataError           a file is damaged or invalid                       exit 65
     ├── MapMissing             there is no map there                              exit 66
     ├── CannotWrite            an output cannot be made: disk full, no permission exit 73
     ├── DaemonUnreachable      no daemon answers                                  exit 69
@@ -37,7 +37,7 @@
     ├── PackageMissing         a Python package is not installed                  exit 69
     └── InternalError          a defect in shmmap: please report it               exit 70
 
-``code`` travels on the wire, the command line returns ``exit_code``, ``hint`` says what can be done.
+``code`` is the error's name in the protocol, ``exit_code`` the command's exit code, ``hint`` the remedy.
 """
 
 from __future__ import annotations
@@ -93,12 +93,12 @@ class ShmmapError(Exception):
     Parameters
     ----------
     message, hint
-        What is wrong and where, in one sentence; and what the reader can do about it, if anything.
+        The problem and its place, in one sentence; and the remedy, if there is one.
     """
 
     code: ClassVar[str] = "error"
     exit_code: ClassVar[int] = 70
-    advice: ClassVar[str] = ""  # the hint where no other is given
+    advice: ClassVar[str] = ""  # the default hint
 
     def __init__(self, message: str, *, hint: str = "") -> None:
         super().__init__(message)
@@ -110,11 +110,11 @@ class ShmmapError(Exception):
 
 
 class ShmmapWarning(UserWarning):
-    """A result is less than what was asked for, or contradicts itself; the text says what and why."""
+    """A result is incomplete or contradictory; the text contains the details and the reason."""
 
 
 class ConfigError(ShmmapError):
-    """A setting is wrong; ``key`` names it and ``origin`` says where it was set."""
+    """A setting is wrong; ``key`` is its name and ``origin`` the place where it was set."""
 
     code = "bad_config"
     exit_code = 78
@@ -126,20 +126,20 @@ class ConfigError(ShmmapError):
 
 
 class BadRequest(ShmmapError):
-    """An argument or a message makes no sense; asking again unchanged cannot help."""
+    """An argument or a message is invalid; repeating the same request cannot succeed."""
 
     code = "bad_request"
     exit_code = 2
 
 
 class NoColumn(BadRequest, KeyError):
-    """A cell's layer has no column of that name, or not the one that the question needs."""
+    """A cell's layer does not have the named or required column."""
 
     code = "no_column"
 
 
 class MapDataError(ShmmapError):
-    """A file, ``path``, is not what it claims to be: at byte ``offset``, None where it has no place.
+    """The file ``path`` is damaged or invalid at byte ``offset``; None if there is no single place.
 
     ``cause`` is one of a small set of names, for programs: ``truncated``, ``zero_filled``, ...
     """
@@ -159,21 +159,21 @@ class MapDataError(ShmmapError):
 
 
 class MapMissing(ShmmapError):
-    """There is no map where one was named."""
+    """There is no map at the given place."""
 
     code = "map_missing"
     exit_code = 66
 
 
 class CannotWrite(ShmmapError):
-    """An output cannot be made: the disk is full, not writable, or something else is in its place."""
+    """An output cannot be written: the disk is full or not writable, or another file is in its place."""
 
     code = "cannot_write"
     exit_code = 73  # EX_CANTCREAT of sysexits.h
 
 
 class DaemonUnreachable(ShmmapError):
-    """No daemon answers at the endpoint; the subclass says why."""
+    """No daemon answers at the endpoint; the subclass gives the reason."""
 
     code = "unreachable"
     exit_code = 69
@@ -231,7 +231,7 @@ class CannotStart(ShmmapError):
 
 
 class NoSession(ShmmapError):
-    """The daemon does not know the connection's session (it was restarted): say hello again."""
+    """The daemon does not know the connection's session, after a restart: send `Hello` again."""
 
     code = "no_session"
     exit_code = 1
@@ -245,7 +245,7 @@ class NotPermitted(ShmmapError):
 
 
 class LimitReached(ShmmapError):
-    """A limit of this process is reached: on files, threads or memory; the message names it."""
+    """A limit of this process on files, threads or memory is reached; the message names the limit."""
 
     code = "limit_reached"
     exit_code = 71  # EX_OSERR of sysexits.h
@@ -259,7 +259,7 @@ class Busy(ShmmapError):
 
 
 class LiveInterrupted(ShmmapError):
-    """The process that keeps live maps ended before it answered: send the same again, it counts once."""
+    """The process that keeps live maps ended before it answered: repeat the request, it counts once."""
 
     code = "live_interrupted"
     exit_code = 75
@@ -288,8 +288,8 @@ class SegmentCorrupt(SegmentError):
 class CellError(ShmmapError):
     """One cell, ``cell_id``, ``layer``, could not be loaded; other cells and requests are unaffected.
 
-    ``holders``, for `OverBudget`, are the users of the memory; ``str`` of each is a line to read.  ``box`` is
-    where the cell lies, ``min_x, min_y, max_x, max_y`` in metres, map frame; None where that is not known.
+    ``holders``, for `OverBudget`, are the users of the memory; ``str`` of each is a readable line.  ``box``
+    is the cell's ``min_x, min_y, max_x, max_y`` in metres, map frame; None if that is not known.
     """
 
     code = "cell_error"
@@ -337,7 +337,7 @@ class NoSpace(CellError):
 
 
 class Offline(CellError):
-    """Where the cell comes from cannot be reached at present: a passing problem, tried again by itself."""
+    """The cell's origin cannot be reached at present; the daemon retries by itself."""
 
     code = "offline"
     exit_code = 75
@@ -345,7 +345,7 @@ class Offline(CellError):
 
 
 class PackageMissing(ShmmapError, ImportError):
-    """A Python package that this needs is not installed; a client-only install has few of them."""
+    """A required Python package is not installed; a client-only installation lacks many packages."""
 
     code = "package_missing"
     exit_code = 69
@@ -358,7 +358,7 @@ class InternalError(ShmmapError):
 
 
 def error_from_wire(code: str, message: str, hint: str = "") -> ShmmapError:
-    """Return the error a daemon's reply describes; an unknown code becomes `ShmmapError`."""
+    """Return the error that a daemon's reply describes; an unknown code becomes `ShmmapError`."""
     kinds: list[type[ShmmapError]] = [ShmmapError]
     for kind in kinds:
         kinds += kind.__subclasses__()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What happens in the daemon, as it happens: cells loaded, changed, evicted; clients that join and leave.
+"""Live events of the daemon: cells loaded, changed and evicted, clients that join and leave.
 
 ::
 
@@ -9,8 +9,8 @@
         for event in stream:
             print(event)
 
-`EventStream` iterates over events, which are the other classes here, by kind; `MissedEvents` is what it gives
-where some are lost.
+`EventStream` iterates over events; each kind of event is one of the other classes here.  For lost events it
+yields `MissedEvents`.
 """
 
 from __future__ import annotations

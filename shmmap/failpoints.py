@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Places where a test can kill a process, or make it fail: ``SHMMAP_TEST_CRASH=STEP[:N[:FILE]]``.
+"""Steps at which a test can kill a process, or make it fail: ``SHMMAP_TEST_CRASH=STEP[:N[:FILE]]``.
 
 The process sends itself SIGKILL when it reaches STEP for the Nth time (by default the first).  With FILE,
 the process creates this file first, and does not die if the file exists: so only one process dies, its
@@ -73,7 +73,7 @@ CLIENT_STEPS: Final = ("client.answer", "client.open", "client.lock", "client.ma
 
 
 def _untouched(label: str) -> None:
-    """Do nothing: no test wants anything of this process."""
+    """Do nothing: no test uses a step in this process."""
 
 
 def _parsed(wanted: str) -> tuple[str, int, str]:
@@ -103,7 +103,7 @@ class _Crash:
             return
         self._left -= 1
         if self._left == 0 and self._is_first():
-            import signal  # costs every client half a millisecond, and is for tests
+            import signal  # takes half a millisecond, and only tests need it
 
             os.kill(os.getpid(), signal.SIGKILL)
 
@@ -120,4 +120,4 @@ class _Crash:
 _crash: Final = os.environ.get("SHMMAP_TEST_CRASH", "")
 _defect: Final = os.environ.get("SHMMAP_TEST_DEFECT", "")
 step: Final = _Crash(_crash) if _crash else _Defect(_defect) if _defect else _untouched
-"""Called with the name of the step the process has come to."""
+"""Called with the name of the step that the process has reached."""

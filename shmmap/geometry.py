@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Areas a client asks for, and which cell boxes they touch.
+"""Areas that a client requests, and tests which cell boxes they touch.
 
-All coordinates are metres in the map frame.  Borders are closed: a box that only touches an area
-belongs to it.  A *box* is ``(min_x, min_y, max_x, max_y)``.  Of an area, ``z`` says which
-heights are of interest, (lowest, highest); None: all.
+All coordinates are metres in the map frame.  Borders are closed: a box that only touches an area belongs to
+it.  A *box* is ``(min_x, min_y, max_x, max_y)``.  ``z`` of an area is its range of heights, (lowest,
+highest); None: all.
 """
 
 from __future__ import annotations
@@ -43,16 +43,16 @@ def _is_finite(value: float) -> bool:
     try:
         return math.isfinite(value) and getattr(value, "shape", ()) == ()
     except (TypeError, ValueError, OverflowError):
-        return False  # no number at all
+        return False  # not a number
 
 
 def checked_heights(z: tuple[float, float] | None) -> tuple[float, float] | None:
-    """Return heights of interest, (lowest, highest), metres, map frame; None: all.
+    """Return a checked range of heights, (lowest, highest), metres, map frame; None: all.
 
     Raises
     ------
     BadRequest
-        They are not two numbers, the lower one first.
+        The range is not two numbers, the lower one first.
     """
     if z is None:
         return None
@@ -66,7 +66,7 @@ def checked_heights(z: tuple[float, float] | None) -> tuple[float, float] | None
 
 
 def heights_overlap(z: tuple[float, float], z_min: float, z_max: float) -> bool:
-    """Whether the heights ``[z_min, z_max]`` touch the closed range ``z``; unknown (NaN) heights do."""
+    """Return whether heights ``[z_min, z_max]`` touch the closed range ``z``; unknown (NaN) ones do."""
     return not (z_max < z[0] or z_min > z[1])
 
 
@@ -105,24 +105,24 @@ class Circle(msgspec.Struct, frozen=True):
 
     @property
     def center(self) -> tuple[float, float]:
-        """Where distance is measured from."""
+        """Point from which distance is measured."""
         return self.x, self.y
 
     @property
     def reach(self) -> float:
-        """How far its farthest point is from its center."""
+        """Distance of the area's farthest point from its centre, metres."""
         return self.radius
 
     def around(self, x: float, y: float, wider_m: float = 0.0) -> Circle:
-        """Return the same area around another place, wider by so much on each side."""
+        """Return the same area around another place, wider by ``wider_m`` on each side."""
         return Circle(x, y, self.radius + wider_m, self.z)
 
     def contains_circle(self, x: float, y: float, radius: float) -> bool:
-        """Whether a circle lies wholly in this one, border included."""
+        """Return whether a circle lies wholly in this one, border included."""
         return math.hypot(x - self.x, y - self.y) + radius <= self.radius
 
     def overlaps(self, boxes: Floats) -> Mask:
-        """Which of ``boxes`` ((N, 4) float64) the circle touches, as (N,) bool."""
+        """Return which of ``boxes`` ((N, 4) float64) the circle touches, (N,) bool."""
         dx = np.maximum(np.maximum(boxes[:, 0] - self.x, self.x - boxes[:, 2]), 0.0)
         dy = np.maximum(np.maximum(boxes[:, 1] - self.y, self.y - boxes[:, 3]), 0.0)
         inside: Mask = dx * dx + dy * dy <= self.radius * self.radius
@@ -156,26 +156,26 @@ class AutowareSquare(msgspec.Struct, frozen=True):
 
     @property
     def center(self) -> tuple[float, float]:
-        """Where distance is measured from."""
+        """Point from which distance is measured."""
         return self.x, self.y
 
     @property
     def reach(self) -> float:
-        """How far its farthest point is from its center."""
+        """Distance of the area's farthest point from its centre, metres."""
         return math.sqrt(2.0) * self.radius
 
     def around(self, x: float, y: float, wider_m: float = 0.0) -> AutowareSquare:
-        """Return the same area around another place, wider by so much on each side."""
+        """Return the same area around another place, wider by ``wider_m`` on each side."""
         return AutowareSquare(x, y, self.radius + wider_m, self.z)
 
     def contains_circle(self, x: float, y: float, radius: float) -> bool:
-        """Whether a circle lies wholly in the square, as far as float32 lets one be sure."""
+        """Return whether a circle surely lies wholly in the square, allowing for float32 rounding."""
         bounds = self.bounds
-        margin = float(np.spacing(np.float32(max(map(abs, bounds)))))  # by which a box may be rounded away
+        margin = float(np.spacing(np.float32(max(map(abs, bounds)))))  # possible rounding error of a box
         return _inside(bounds, x, y, radius + margin)
 
     def overlaps(self, boxes: Floats) -> Mask:
-        """Which of ``boxes`` ((N, 4) float64) the square touches, as (N,) bool."""
+        """Return which of ``boxes`` ((N, 4) float64) the square touches, (N,) bool."""
         x, y, radius = (float(np.float32(v)) for v in (self.x, self.y, self.radius))
         rounded = boxes.astype(np.float32).astype(np.float64)
         inside: Mask = (
@@ -213,26 +213,26 @@ class Box(msgspec.Struct, frozen=True):
 
     @property
     def center(self) -> tuple[float, float]:
-        """Where distance is measured from."""
+        """Point from which distance is measured."""
         return (self.min_x + self.max_x) / 2, (self.min_y + self.max_y) / 2
 
     def around(self, x: float, y: float, wider_m: float = 0.0) -> Box:
-        """Return the same area around another place, wider by so much on each side."""
+        """Return the same area around another place, wider by ``wider_m`` on each side."""
         dx = 0.5 * (self.max_x - self.min_x) + wider_m
         dy = 0.5 * (self.max_y - self.min_y) + wider_m
         return Box(x - dx, y - dy, x + dx, y + dy, self.z)
 
     @property
     def reach(self) -> float:
-        """How far its farthest point is from its center."""
+        """Distance of the area's farthest point from its centre, metres."""
         return 0.5 * math.hypot(self.max_x - self.min_x, self.max_y - self.min_y)
 
     def contains_circle(self, x: float, y: float, radius: float) -> bool:
-        """Whether a circle lies wholly in the rectangle, border included."""
+        """Return whether a circle lies wholly in the rectangle, border included."""
         return _inside(self.bounds, x, y, radius)
 
     def overlaps(self, boxes: Floats) -> Mask:
-        """Which of ``boxes`` ((N, 4) float64) the rectangle touches, as (N,) bool."""
+        """Return which of ``boxes`` ((N, 4) float64) the rectangle touches, (N,) bool."""
         inside: Mask = (
             (boxes[:, 0] <= self.max_x)
             & (boxes[:, 2] >= self.min_x)
@@ -246,7 +246,7 @@ Area: TypeAlias = Circle | AutowareSquare | Box
 
 
 def distance_to_boxes(x: float, y: float, boxes: Floats) -> Floats:
-    """Distance in metres from a point to the nearest point of each box ((N, 4) float64), as (N,)."""
+    """Return the distance from a point to the nearest point of each box ((N, 4) float64), (N,) metres."""
     dx = np.maximum(np.maximum(boxes[:, 0] - x, x - boxes[:, 2]), 0.0)
     dy = np.maximum(np.maximum(boxes[:, 1] - y, y - boxes[:, 3]), 0.0)
     distance: Floats = np.hypot(dx, dy)

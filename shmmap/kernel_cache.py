@@ -1,16 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compiled kernels on disk: where they are kept, which of them may be used; without importing numba.
+"""Store compiled kernels on disk, and check which may be used; does not import numba.
 
-They are in ``NUMBA_CACHE_DIR`` where that is set, else in ``$CACHE_DIRECTORY/kernels`` (a service), else in
+The directory is ``NUMBA_CACHE_DIR`` if that is set, else ``$CACHE_DIRECTORY/kernels`` (a service), else
 ``$XDG_CACHE_HOME/shmmap/kernels`` or ``~/.cache/shmmap/kernels``.
 
-Nothing depends on them: what is missing, damaged, of another version or not to be trusted is compiled
-again, and where nothing can be written kernels are compiled in each process.  A kernel is code that this
-process will run, so directory and file have to belong to this user or to root, and no other account may write
-there.
+The files are optional: a kernel whose file is missing, damaged, of another version or untrusted is compiled
+again, and without a writable directory each process compiles its kernels.  A kernel is code that this process
+runs, so directory and file must belong to this user or root, and no other account may write there.
 
 A file: 8 bytes of magic, the SHA-256 of what the kernel was made from, the SHA-256 of the kernel, the kernel.
-It is complete and flushed before it has its name.
+A file is complete and flushed before it gets its name.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ _unkept: list[str] = []
 
 
 def kernel_directory() -> Path | None:
-    """Return the directory of compiled kernels, made if missing; None, logged once, if none can be used."""
+    """Return the directory of compiled kernels, created if missing; None, logged once, if unusable."""
     try:
         path = _place()
         with contextlib.suppress(FileExistsError):
@@ -56,7 +55,7 @@ def kernel_directory() -> Path | None:
 def compiled_mark() -> Path | None:
     """Return the file that marks all kernels of layers as compiled, for this version, Python and numba.
 
-    None where they cannot be kept, or there is no numba.
+    None if kernels cannot be stored, or numba is not installed.
     """
     directory, numba = kernel_directory(), importlib.util.find_spec("numba")
     if directory is None or not os.access(directory, os.W_OK) or numba is None or not numba.origin:
@@ -69,14 +68,14 @@ def compiled_mark() -> Path | None:
 
 
 def read_kernel(name: str, source: bytes) -> bytes | None:
-    """Return the kernel of this name that was made from ``source``; None where there is none to be used.
+    """Return the kernel of this name that was made from ``source``; None if there is no usable one.
 
     Parameters
     ----------
     name
-        Of its file.
+        Name of the kernel's file.
     source
-        Whatever the kernel depends on.
+        All data on which the kernel depends.
     """
     if (directory := kernel_directory()) is None:
         return None
@@ -95,7 +94,7 @@ def read_kernel(name: str, source: bytes) -> bytes | None:
 
 
 def write_kernel(name: str, source: bytes, data: bytes) -> None:
-    """Keep a kernel, in place of another one of that name; where it cannot be kept that is said once."""
+    """Store a kernel, replacing any of that name; a failure is logged once."""
     if (directory := kernel_directory()) is None:
         return
     unfinished = f"{name}.{secrets.token_hex(4)}.tmp"
@@ -120,7 +119,7 @@ def write_kernel(name: str, source: bytes, data: bytes) -> None:
 
 
 def discard(name: str, why: object) -> None:
-    """Remove a kernel that cannot be used, and the mark that all are compiled; say so once."""
+    """Remove an unusable kernel, and the mark that all are compiled; logged once."""
     if (directory := kernel_directory()) is None:
         return
     _say("compiled kernel discarded", path=directory / name, reason=_words(why))
@@ -131,9 +130,9 @@ def discard(name: str, why: object) -> None:
 
 
 def all_kept() -> bool:
-    """Whether this process has kept whatever it compiled, and that is on the disk.
+    """Return whether all kernels that this process compiled are stored and flushed to disk.
 
-    Files that killed processes left unfinished are removed.
+    Also removes unfinished files of killed processes.
     """
     if _unkept or (directory := kernel_directory()) is None:
         return False
@@ -161,7 +160,7 @@ def _place() -> Path:
 
 @contextlib.contextmanager
 def _opened(directory: Path) -> Iterator[int]:
-    """Open a directory, check it, and yield its descriptor: what is opened in it is in that directory."""
+    """Open and check a directory, and yield its descriptor, relative to which files are opened."""
     fd = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         _check_trust(os.fstat(fd), directory)
@@ -172,7 +171,7 @@ def _opened(directory: Path) -> Iterator[int]:
 
 def _read(directory: Path, name: str) -> bytes:
     with _opened(directory) as parent:
-        # a pipe is not waited for; a link is not followed
+        # does not block on a pipe, and does not follow a link
         fd = os.open(name, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=parent)
     try:
         status = os.fstat(fd)
@@ -210,7 +209,7 @@ def _words(why: object) -> str:
 
 
 def _say(event: str, **details: object) -> None:
-    """Log something once a process, and not again in its children."""
+    """Log an event once per process, and not again in its children."""
     if event not in _said:
         _said.add(event)
         log.warning(event, **details)

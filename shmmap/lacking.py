@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an answer lacks, in the words of the command line and of warnings.
+"""Describe what is missing in an answer, for the command line and for warnings.
 
-That is cells that failed, that are being loaded, or that are empty, and places where the map has none.
+That is cells that failed, are being loaded, or are empty, and areas where the map has no cells.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ __all__ = [
 _NOT_COVERED: Final = "the daemon does not know yet all that the map has there"
 _OUT_OF_REACH: Final = "the list of cells there cannot be reached at present"
 _NAMED_CELLS: Final = 3
-_MAX_CELLS: Final = 20_000  # to look at each for one that looks alike takes a second at most
+_MAX_CELLS: Final = 20_000  # searching them for similar ids takes at most a second
 _MAX_LINES: Final = 10  # of a warning
 
 _Bounds = tuple[float, float, float, float]
@@ -46,25 +46,25 @@ _Bounds = tuple[float, float, float, float]
 def judge(
     client: Client, found: CellSet, area: Area | None, *, waited: bool, strict: bool, new: bool = True
 ) -> None:
-    """Say what an answer lacks: as a `ShmmapWarning` where the program asked, or as an error.
+    """Report missing cells of an answer: as a `ShmmapWarning` at the program's call, or as an error.
 
     Parameters
     ----------
     client
-        Whose answer it is.
+        Client that received the answer.
     area
-        What was asked about; None: ids.
+        The requested area; None for a request by ids.
     waited
-        Whether the daemon was given time to load: otherwise that cells are pending is no news.
+        Whether the daemon had time to load; without it, pending cells are expected and not reported.
     strict
-        Raise it.
+        Raise an error instead of a warning.
     new
-        Whether all cells were to come; False: those that are not held.
+        Whether all cells were requested; False: only those that are not held.
 
     Raises
     ------
     CellError
-        Of a cell that failed, that is still pending (`LoadTimeout`), or where there is none (`UnknownCell`).
+        A cell failed, is still pending (`LoadTimeout`), or does not exist (`UnknownCell`).
     """
     if strict:
         if (error := _error_of(client, found, area, new)) is not None:
@@ -90,7 +90,7 @@ def judge(
 
 
 def not_covered(found: CellSet) -> tuple[str, str]:
-    """Why an answer does not have all that the map has there, and a hint."""
+    """Return why an answer may lack cells of the map, and a hint."""
     return _OUT_OF_REACH if found.reason else _NOT_COVERED, "ask again later"
 
 
@@ -113,7 +113,7 @@ def _error_of(client: Client, found: CellSet, area: Area | None, new: bool) -> S
 
 
 def _nothing(client: Client, found: CellSet, area: Area | None) -> list[tuple[str, str]]:
-    """Where a complete answer has nothing in it, what is said and the hint."""
+    """Return the message and hint for a complete answer without cells."""
     if not found.cells:
         return [no_cell_there(client.welcome, area)] if area is not None else []
     empty = empty_layers(found)
@@ -121,7 +121,7 @@ def _nothing(client: Client, found: CellSet, area: Area | None) -> list[tuple[st
 
 
 def empty_layers(found: CellSet) -> str:
-    """Say which layers have no points in any of the cells; empty where all have some."""
+    """Return a text about layers that have no points in any cell; empty if all have some."""
     rows: dict[str, int] = {}
     for cell in found.cells:
         rows[cell.layer] = rows.get(cell.layer, 0) + cell.points
@@ -138,7 +138,7 @@ def _asked(found: CellSet) -> int:
 
 
 def _level_of_program() -> int:
-    """Return how far up the stack the program's own code is."""
+    """Return the stack level of the program's own code."""
     level, frame = 1, sys._getframe(1)
     while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("shmmap."):
         level, frame = level + 1, frame.f_back
@@ -154,10 +154,10 @@ def pending_lines(pending: Iterable[PendingLayer]) -> list[str]:
 
 
 def failure_lines(failed: Iterable[CellError]) -> list[str]:
-    """Return one line for each cause, and below it what to do and the users of the memory."""
+    """Return one line per cause, followed by the remedy and the users of the memory."""
     causes: dict[tuple[str, str, str], list[CellError]] = {}
     for error in failed:
-        # a file's message begins with its path, which the cell's id is
+        # a file's message begins with its path, which is the cell's id
         reason = error.message.removeprefix(_named(error)).removeprefix(f"{error.cell_id}: ")
         causes.setdefault((error.code, error.layer, reason), []).append(error)
     lines = []
@@ -185,7 +185,7 @@ def _named(error: CellError) -> str:
 
 
 def _holder_lines(errors: Iterable[CellError]) -> list[str]:
-    """Describe the users of memory, the largest first; each cell's failure says it again."""
+    """Describe the users of memory, largest first, each once although every failed cell lists them."""
     most: dict[int, Holder] = {}
     for error in errors:
         for holder in error.holders:
@@ -205,7 +205,7 @@ def _who(holder: Holder) -> str:
     return f"{holder.client or holder.command or 'a client'}, pid {holder.pid or '?'}"
 
 
-# --- where there is nothing ---------------------------------------------------------------------------
+# --- answers without cells ---------------------------------------------------------------------------
 
 
 def area_text(area: Area) -> str:
@@ -231,7 +231,7 @@ def extent_text(box: _Bounds) -> str:
 
 
 def no_cell_there(welcome: Welcome, area: Area) -> tuple[str, str]:
-    """Say that no cell of the map touches an area, and where the map is; returns that and a hint."""
+    """Return the message that no cell touches an area, with the map's extent, and a hint."""
     spans = f"the map spans {extent_text(welcome.bounds)}" if welcome.bounds else "the map has no cells"
     hint = ""
     if any(welcome.origin):
@@ -244,7 +244,7 @@ def no_cell_there(welcome: Welcome, area: Area) -> tuple[str, str]:
 
 
 def near_cells_hint(client: Client, unknown: Sequence[str]) -> str:
-    """Return a hint for ids that the map does not have: those that look alike, or where ids are found."""
+    """Return a hint for unknown ids: similar ids, or how to list ids."""
     import difflib  # one millisecond, after a misspelling only
 
     if not unknown:

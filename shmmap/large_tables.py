@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Dictionaries and arrays as long as a map, of which no single step takes long."""
+"""Dictionaries and arrays for large maps, without a single operation that takes long."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ K = TypeVar("K", bound=Hashable)
 V = TypeVar("V")
 T = TypeVar("T")
 FEW: Final = 2048
-"""Entries that are kept in one dict: to share these out takes a fifth of a millisecond."""
+"""Most entries in one dict; splitting such a dict takes a fifth of a millisecond."""
 _SHARDS: Final = 64
 _RAISE: Final = object()
 
 
 class ShardedDict(MutableMapping[K, V]):
-    """A mapping like a dict, but in no order."""
+    """A mapping like a dict, but unordered."""
 
     __slots__ = ("_shards",)
 
@@ -102,11 +102,11 @@ class ShardedDict(MutableMapping[K, V]):
 
 
 SMALL_BYTES: Final = 1 << 21
-"""For less numpy does not ask for huge pages, and no other memory is worth a mapping."""
+"""Size below which numpy requests no huge pages, and a separate mapping is not worthwhile."""
 
 
 def sparse_zeros(shape: int | tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-    """Return an array of zeros that takes memory by small pages, as it is written."""
+    """Return an array of zeros whose memory is allocated in small pages, as it is written."""
     nbytes = math.prod(shape if isinstance(shape, tuple) else (shape,)) * np.dtype(dtype).itemsize
     if nbytes < SMALL_BYTES:
         return np.zeros(shape, dtype)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Imports on first use: a package's public names (PEP 562), and one clear line where a package is missing.
+"""Import public names on first use (PEP 562), and report a missing package in one clear line.
 
-So importing a package costs next to nothing, and a command line starts, and can say which package is missing,
-where not all are installed.  The package imports its public names under ``if TYPE_CHECKING:``, for type
-checkers; the same imports say where a name comes from when it is first used, so that there is no second list.
+So importing a package takes almost no time.  A command starts even if not all packages are installed, and can
+name the missing one.  The package imports its public names under ``if TYPE_CHECKING:``, for type checkers;
+the same imports locate a name at its first use, so that there is no second list.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from shmmap.segment.process_limits import no_files_left
 __all__ = ["FOR_REMOTE", "TO_SIGN", "lazy_names", "lazy_public_names", "needed_packages", "public_names"]
 
 FOR_REMOTE: Final = "obstore zstandard"
-"""What a published map needs, together: the extra ``remote``."""
+"""Packages for a published map: the extra ``remote``."""
 TO_SIGN: Final = "tuf 'securesystemslib[crypto]'"
-"""What a signed map needs: the extra ``sign``."""
+"""Packages for a signed map: the extra ``sign``."""
 
 _PACKAGES: Final = {
     "securesystemslib": "securesystemslib[crypto]",
@@ -33,31 +33,31 @@ _PACKAGES: Final = {
     "zmq": "pyzmq",
     "open3d": "open3d-cpu",
 }
-"""Packages that are not called as the module they bring."""
+"""Packages whose name differs from that of their module."""
 
 _OPTIONAL: Final = frozenset(
     {"cyclonedds", "laspy", "obstore", "pyopencl", "securesystemslib[crypto]", "tifffile", "tuf", "zstandard"}
 )
-"""Packages that no ordinary install brings: `project.optional-dependencies`."""
+"""Packages that an ordinary installation lacks: `project.optional-dependencies`."""
 
 _OURS: Final = ("shmmap", "shmmap_clients")
 
 
 @contextmanager
 def needed_packages(what: str, *, together: str = "") -> Iterator[None]:
-    """Say which package is missing where something is imported, instead of a traceback.
+    """Replace the traceback of a failed import by an error that names the missing package.
 
     Parameters
     ----------
     what
-        What needs it: a function, a program.
+        The function or program that needs the package.
     together
-        What to install where one is of little use without others.
+        Packages to install together, if one is of little use without the others.
 
     Raises
     ------
     PackageMissing
-        For the `ModuleNotFoundError` of any other module.
+        A module outside of shmmap was not found.
 
     Examples
     --------
@@ -83,12 +83,12 @@ def needed_packages(what: str, *, together: str = "") -> Iterator[None]:
 
 
 def lazy_names(package: str) -> Callable[[str], Any]:
-    """Return a package's ``__getattr__``, which loads what the package imports under ``if TYPE_CHECKING:``.
+    """Return a package's ``__getattr__``, which loads names imported under ``if TYPE_CHECKING:``.
 
     Parameters
     ----------
     package
-        Its ``__name__``.
+        The package's ``__name__``.
     """
     modules: dict[str, str] = {}
 
@@ -105,9 +105,9 @@ def lazy_names(package: str) -> Callable[[str], Any]:
 
 
 def lazy_public_names(package: str) -> Callable[[str], Any]:
-    """Return what `lazy_names` does; what keeps a name from being loaded is said in one clear line.
+    """Return a ``__getattr__`` as `lazy_names` does, which reports a failed load in one clear line.
 
-    What it needs for that is imported beforehand: there may be no descriptor left for it.
+    The modules needed for the report are imported beforehand: later there may be no descriptor left.
     """
     load = lazy_names(package)
 

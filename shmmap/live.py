@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Live maps: made while driving, by processes that write them, for those that read them (``LIVE_MAPS.md``).
+"""Live maps: maps that some processes write while driving and others read (``LIVE_MAPS.md``).
 
-`shmmap.Client.live` returns a `LiveMap`; `LiveMap.mapper` the `LiveMapper` that scans are inserted with.
+`shmmap.Client.live` returns a `LiveMap`; `LiveMap.mapper` the `LiveMapper` that inserts scans.
 
 ================  ==============================================================================
 `LiveMap`         a live map as readers see it: voxels of an area, states of points, changes
 `LiveMapper`      inserts scans into a live map
-`ScanFilter`      which points of a scan count
-`ScanCounts`      what became of the points of a scan
+`ScanFilter`      selects the points of a scan to use
+`ScanCounts`      numbers of points of a scan, used and left out
 `Occupancy`       the parameters of the occupancy model: log odds of a hit, a miss, the thresholds
 `Sphere`          an area in space
-`Voxels`          what `LiveMap.voxels` returns
-`ChunkInfo`       what `LiveMap.chunks` says of one chunk
-`LiveMapRow`      what `shmmap.Client.live_maps` says of one map
+`Voxels`          the result of `LiveMap.voxels`
+`ChunkInfo`       one chunk in the result of `LiveMap.chunks`
+`LiveMapRow`      one map in the result of `shmmap.Client.live_maps`
 ================  ==============================================================================
 """
 

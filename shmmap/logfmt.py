@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Log lines that people search and programs read: what happened, then ``key=value`` for each detail.
+"""Log lines for people and programs: the event, then ``key=value`` for each detail.
 
 ::
 
     evicted cell=city/20_40.pcd layer=points bytes=1261568 reason=room
     load failed cell="north gate.pcd" code=load_failed message="points are missing"
 
-Names of files and clients are other people's words: what could move a terminal's cursor, or begin
-another line, is written as an escape.
+Names of files and clients are untrusted: characters that could move a terminal's cursor or begin another line
+are escaped.
 
 The daemon's log goes to stderr: with journald's priorities under systemd, with time and level elsewhere.
 """
@@ -37,7 +37,7 @@ def logfmt(event: str, **details: object) -> str:
     Parameters
     ----------
     event
-        What happened, in words that are always the same.
+        The event, in constant words without details.
     **details
         Written in this order; floats to three decimals, None is left out, and a value is quoted where
         it has blanks, quotes, ``=`` or characters that are not printable, or is empty.
@@ -72,25 +72,25 @@ class _Log:
         self._logger = logging.getLogger("shmmap")
 
     def debug(self, event: str, **details: object) -> None:
-        """Log what only a search for a defect needs."""
+        """Log details for debugging."""
         if self._logger.isEnabledFor(logging.DEBUG):
             self._logger.debug(logfmt(event, **details))
 
     def info(self, event: str, **details: object) -> None:
-        """Log what happens."""
+        """Log a normal event."""
         if self._logger.isEnabledFor(logging.INFO):
             self._logger.info(logfmt(event, **details))
 
     def warning(self, event: str, **details: object) -> None:
-        """Log what an operator should know."""
+        """Log an event that needs an operator's attention."""
         self._logger.warning(logfmt(event, **details))
 
     def error(self, event: str, **details: object) -> None:
-        """Log what failed."""
+        """Log a failure."""
         self._logger.error(logfmt(event, **details))
 
     def exception(self, event: str, **details: object) -> None:
-        """Log what failed, with the traceback of the exception being handled."""
+        """Log a failure with the traceback of the exception being handled."""
         self._logger.exception(logfmt(event, **details))
 
 
@@ -106,7 +106,7 @@ _PRIORITIES: Final = {
 
 
 class _Lines(logging.Formatter):
-    """One line each, whatever a message contains; only a traceback has more of them."""
+    """Formatter with one line per message, whatever it contains; only a traceback has more lines."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802  logging's name
         record.message = escaped(record.message)
@@ -117,7 +117,7 @@ class _Lines(logging.Formatter):
 
 
 class _JournalLines(_Lines):
-    """``<priority>message``: journald adds the time itself; every line carries the prefix."""
+    """``<priority>message``: journald adds the time itself; every line has the prefix."""
 
     def format(self, record: logging.LogRecord) -> str:
         prefix = f"<{_PRIORITIES.get(record.levelno, 6)}>"

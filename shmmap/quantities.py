@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Memory, time and coordinates as a person reads them: the same in every screen, log and message."""
+"""Format memory, time and coordinates for readers, the same way in all screens, logs and messages."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ __all__ = ["counted", "format_bytes", "format_duration", "format_metres", "forma
 
 
 def counted(count: int, noun: str) -> str:
-    """Return a number of things: ``"1 cell"``, ``"2,400 cells"``."""
+    """Return a count with its noun: ``"1 cell"``, ``"2,400 cells"``."""
     return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
 

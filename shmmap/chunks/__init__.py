@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The rolling map's voxels: where they lie, what a scan does to them, and the bytes that hold them.
+"""Voxels of the rolling map: their indices, their update by scans, and their storage as bytes.
 
-Pure: nothing here knows a daemon, a socket or a directory.  ``CHUNKS.md`` is the byte-exact document.
+Independent of daemon, sockets and directories.  ``CHUNKS.md`` is the byte-exact specification.
 
-- `voxels`: which voxel, chunk and brick a point lies in
-- `occupancy`: which points of a scan count, and what a hit and a miss are worth
-- `marking`: a scan becomes the lists of voxels that it hits and passes through
+- `voxels`: the voxel, chunk and brick that contain a point
+- `occupancy`: which points of a scan are used, and the log-odds of a hit and a miss
+- `marking`: turns a scan into lists of voxels that it hits and passes through
 - `marks`: these lists as bytes, from the mapper to the daemon's worker
 - `layout`: a chunk in shared memory
-- `applying`: marks change a chunk, whole or not at all
+- `applying`: applies marks to a chunk, completely or not at all
 - `chunk_file`: a chunk on disk
 """

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Marks change a chunk wholly or not at all, each scan once, whenever the writer dies.
+"""Apply marks to a chunk atomically and exactly once per scan, even if the writer dies.
 
-Before it changes anything, a writer copies what it is about to change into an *undo record*, in shared
-memory of its own that outlives it.  If it dies before the record is out of force, the next writer puts the
-copy back; the mapper, which has no answer yet, sends the scan again.  A chunk remembers the last scan of each
-mapper, so a scan that comes twice changes it once.
+Before a change, the writer copies the affected part of the chunk into an *undo record*, in separate shared
+memory that outlives it.  If the writer dies before it discards the record, the next writer restores the copy,
+and the mapper, which has no answer yet, sends the scan again.  A chunk remembers the last scan of each
+mapper, so a scan that is sent twice changes it once.
 
-Readers see a chunk whole by its sequence: odd while it is written (`ChunkView.state`).
+Readers detect a change in progress by the chunk's sequence, which is odd meanwhile (`ChunkView.state`).
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ UNDO_BYTES: Final = _BODY_AT + 2 * BRICKS + MAX_BYTES
 
 
 class UndoRecord:
-    """What a chunk was before the writer began to change it; at most one is in force.
+    """Copy of the part of a chunk that the writer is changing; at most one record is valid at a time.
 
     Parameters
     ----------
@@ -70,13 +70,13 @@ class UndoRecord:
         return (ChunkKey(x, y, z), generation) if magic == _MAGIC and in_force & 1 else None
 
     def keep(self, view: ChunkView, touched: NDArray[np.uint16]) -> None:
-        """Copy a chunk's header and the bricks at these places, and put the record in force."""
+        """Copy a chunk's header and the bricks at these places, and mark the record as valid."""
         identity = view.identity
         count = len(touched)
         _UNDO.pack_into(self._data, 0, _MAGIC, 0, identity.generation, *identity.key, count)
         self._numbers[:count] = touched
         self._header[:] = view.data[:HEADER_BYTES]
-        # nothing is clipped: in any other mode numpy copies twice
+        # no index is ever clipped: in any other mode numpy copies twice
         np.take(view.bricks, touched - 1, axis=0, out=self._bricks[:count], mode="clip")
         step("live.copied")
         kernels.begin_writing(self._in_force)
@@ -86,12 +86,12 @@ class UndoRecord:
         kernels.end_writing(self._in_force)
 
     def restore(self, view: ChunkView) -> None:
-        """Put back what was kept, in the chunk that it is `of`.
+        """Restore the copy into the chunk that `of` names.
 
         Raises
         ------
         SegmentCorrupt
-            The record names bricks that the chunk has not.
+            The record names bricks that the chunk does not have.
         """
         count = _UNDO.unpack_from(self._data)[-1]
         sequence = view.state["sequence"].reshape(1)
@@ -109,14 +109,14 @@ class UndoRecord:
 
 
 class ChunkWriter:
-    """Changes chunks; one process and thread at a time.
+    """Changes chunks; for one process and thread at a time.
 
     Parameters
     ----------
     occupancy
-        How evidence is added up.
+        Parameters of the log-odds update.
     undo
-        Kept while a chunk is changed.
+        Undo record, valid while a chunk is changed.
     """
 
     def __init__(self, occupancy: Occupancy, undo: UndoRecord) -> None:
@@ -125,7 +125,7 @@ class ChunkWriter:
         self._touched = np.zeros(BRICKS, np.uint16)
 
     def new_bricks(self, view: ChunkView, words: NDArray[np.uint16]) -> int:
-        """Return how many bricks a chunk gets by these words."""
+        """Return the number of new bricks that these words add to a chunk."""
         count: int = kernels.touched_bricks(view.index, words, self._touched)
         return count
 
@@ -142,26 +142,26 @@ class ChunkWriter:
         grow: Callable[[int], ChunkView],
         known_mappers: Container[int] = (),
     ) -> ChunkView:
-        """Add one scan's evidence to a chunk, unless it has it already.
+        """Add one scan's evidence to a chunk, unless it was added before.
 
         Parameters
         ----------
         words, bits, hits
-            The chunk's part of `Marks`: checked.
+            The chunk's part of `Marks`, already checked.
         mapper, scan
-            Whose and which; scans of one mapper rise.
+            The scan's mapper, and the scan's number, which increases for each mapper.
         now_ns
             Time of the change, nanoseconds since 1970.
         grow
-            Given a number of bricks, returns a view of the same chunk with room for as many; called before
-            anything changes.
+            Given a number of bricks, returns a view of the same chunk with room for that many; called before
+            any change.
         known_mappers
             Numbers of the map's mappers; the last scans of others may be forgotten.
 
         Returns
         -------
         ChunkView
-            The chunk, grown if it had to.
+            The chunk, grown if necessary.
         """
         row = self._row(view, mapper)
         if row is not None and int(view.state["mappers"]["scan"][row]) >= scan:
@@ -198,7 +198,7 @@ class ChunkWriter:
 
     @staticmethod
     def _row_for(view: ChunkView, known: Container[int]) -> int:
-        """Return a row that is free, or of a mapper that the map does not know any more."""
+        """Return a free row, or that of a mapper that the map does not know any more."""
         numbers = view.state["mappers"]["number"].tolist()
         for row, number in enumerate(numbers):
             if number == 0 or number not in known:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compiled: marks change the voxels of a chunk."""
+"""Compiled kernels that apply marks to the voxels of a chunk."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ _trailing_zeros: Any = numbers.trailing_zeros
 
 @compiled(types.int64(read_only(uint16, 1), read_only(uint16, 1), uint16[::1]), brief=True)
 def touched_bricks(index: Any, words: Any, touched: Any) -> Any:
-    """Find the bricks that words lie in.
+    """Find the bricks that contain the given words.
 
-    ``touched``, (1024,), receives the places of those that there are, each once, and then zeros.  Returns how
-    many there are not yet.
+    ``touched``, (1024,), receives the places of the existing bricks, each once, followed by zeros.  Returns
+    the number of bricks that do not exist yet.
     """
     seen = np.zeros(index.shape[0], np.bool_)
     there, new = 0, 0
@@ -55,13 +55,13 @@ def add_evidence(index: Any, cells: Any, words: Any, bits: Any, hits: Any, limit
     Parameters
     ----------
     index, cells
-        (1024,) where bricks lie, and (N * 256,) their voxels; both changed.
+        Positions of bricks, (1024,), and their voxels, (N * 256,); both are changed.
     words, bits, hits
-        The chunk's marks, and how many of the words are hits; the rest are misses.
+        The chunk's marks, and how many of the words are hits; the others are misses.
     limits
-        What a hit and a miss add, the clamps, and beyond what a voxel is occupied or free.
+        Log-odds of a hit and a miss, the clamps, and the thresholds of occupied and free.
     counts
-        (4,): bricks, and voxels that are known, occupied and free; brought up to date.
+        (4,): numbers of bricks and of known, occupied and free voxels; updated.
     """
     low, high, occupied_above, free_below = limits[2], limits[3], limits[4], limits[5]
     bricks, active, occupied, free = counts[0], counts[1], counts[2], counts[3]
@@ -86,7 +86,7 @@ def add_evidence(index: Any, cells: Any, words: Any, bits: Any, hits: Any, limit
 
 
 def _typed_fence(_context: Any) -> Any:
-    """Everything written before is seen before what is written after."""
+    """Emit a memory fence: earlier writes become visible before later ones."""
 
     def generate(context: Any, builder: Any, _signature: Any, _arguments: Any) -> Any:
         builder.fence("seq_cst")
@@ -100,13 +100,13 @@ _fence: Any = intrinsic(_typed_fence)
 
 @compiled(types.void(uint64[::1]), brief=True)
 def begin_writing(sequence: Any) -> None:
-    """Make the sequence, (1,), odd before anything else changes."""
+    """Make the sequence, (1,), odd before any other change."""
     sequence[0] |= _ONE
     _fence()
 
 
 @compiled(types.void(uint64[::1]), brief=True)
 def end_writing(sequence: Any) -> None:
-    """Make it the next even number after everything else has changed."""
+    """Set the sequence to the next even number after all other changes."""
     _fence()
     sequence[0] = (sequence[0] | _ONE) + _ONE

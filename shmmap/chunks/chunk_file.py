@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A chunk on disk: a header that says what it is, and what is known of it, compressed.  See ``CHUNKS.md``.
+"""A chunk on disk: a header that identifies it, and its known voxels, compressed.  See ``CHUNKS.md``.
 
-Whatever is not exactly as it was written is refused: a file that was cut or changed is noticed by its length
-and its two checksums, one that contradicts itself by its counters.
+A file that is not exactly as written is refused: length and two checksums reveal truncation and changes,
+counters reveal inconsistent content.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ __all__ = [
 
 CHUNK_FILE_VERSION: Final = (1, 0)
 CODECS: Final = {"raw": 0, "zstd": 1, "zlib": 2}
-"""How the body of a file is compressed, by the number that stands in it."""
+"""Compressions of a file's body, with their numbers in the header."""
 FILE_HEADER_BYTES: Final = 128
 
 _MAGIC: Final = b"SHMCHFIL"
@@ -60,11 +60,11 @@ _FIXED_BYTES: Final = _MAPPERS_BYTES + _INDEX_BYTES
 _ZSTD_LEVEL: Final = 3
 _ZLIB_LEVEL: Final = 1
 _of_this_thread: Final = threading.local()
-"""Its compressor: to make one for each chunk would take a fifth of the time to compress it."""
+"""Compressor of each thread: creating one takes a fifth of the time for compressing a chunk."""
 
 
 class ChunkFileHeader(msgspec.Struct, frozen=True):
-    """What a file says of its chunk without being read whole.
+    """Header of a chunk's file, which is read without the body.
 
     Attributes
     ----------
@@ -73,9 +73,9 @@ class ChunkFileHeader(msgspec.Struct, frozen=True):
     codec
         Number of the compression, see `CODECS`.
     version, changed_ns
-        State of the chunk that was saved, and when it came to that.
+        Version of the saved chunk, and the time of its last change.
     active, occupied, free, bricks
-        Voxels known, of these occupied and free; and how many bricks they lie in.
+        Numbers of known voxels, of occupied and free ones among them, and of their bricks.
     stored_bytes, body_hash
         Length of the body as it is stored, and its XXH3-64.
     """
@@ -95,7 +95,7 @@ class ChunkFileHeader(msgspec.Struct, frozen=True):
 
 
 def usual_codec() -> str:
-    """Return ``zstd`` where the package for it is installed, else ``zlib``."""
+    """Return ``zstd`` if its package is installed, else ``zlib``."""
     try:
         import zstandard  # noqa: F401
     except ModuleNotFoundError:
@@ -118,7 +118,7 @@ def _compressor(codec: int) -> Callable[[bytes], bytes]:
 
 
 def _decompress(codec: int, data: memoryview, expected: int) -> bytes:
-    """Return what was compressed, or nothing if it has another length; never make much more than expected."""
+    """Decompress data; return nothing if the length is not ``expected``, without exceeding that by much."""
     if codec == CODECS["raw"]:
         return bytes(data)
     if codec == CODECS["zlib"]:
@@ -136,14 +136,14 @@ def _decompress(codec: int, data: memoryview, expected: int) -> bytes:
 
 
 def encode_chunk(view: ChunkView, codec: str = "zlib") -> bytes:
-    """Return the file of a chunk that is not being written: a copy, or one in the writer's own thread.
+    """Return the file of a chunk that is not being changed: a copy, or called in the writer's thread.
 
     Raises
     ------
     ConfigError
-        There is no such codec.
+        The codec is unknown.
     PackageMissing
-        The package for it is not installed.
+        The codec's package is not installed.
     """
     number = CODECS.get(codec)
     if number is None:
@@ -173,7 +173,7 @@ def read_file_header(data: bytes | memoryview, path: str = "") -> ChunkFileHeade
     Raises
     ------
     MapDataError
-        They are not those of a chunk's file, or of another major version, or were changed.
+        The bytes are not a header of a chunk's file, are of another major version, or were changed.
     """
     if len(data) < FILE_HEADER_BYTES:
         raise MapDataError(
@@ -206,12 +206,12 @@ def read_file_header(data: bytes | memoryview, path: str = "") -> ChunkFileHeade
 
 
 def check_file(data: bytes, path: str = "") -> ChunkFileHeader:
-    """Check the length and the checksums of a whole file; returns its header.
+    """Check the length and the checksums of a whole file; return its header.
 
     Raises
     ------
     MapDataError
-        One of them is wrong, or see `read_file_header`.
+        The length or a checksum is wrong; or as `read_file_header`.
     """
     header = read_file_header(data, path)
     stored = memoryview(data)[FILE_HEADER_BYTES:]
@@ -226,21 +226,21 @@ def check_file(data: bytes, path: str = "") -> ChunkFileHeader:
 
 
 def decode_chunk(data: bytes, identity: ChunkIdentity, path: str = "") -> bytearray:
-    """Return the bytes in memory of a chunk that was saved, as good as new.
+    """Return a saved chunk's bytes as they are in memory.
 
     Parameters
     ----------
     data
         The whole file.
     identity
-        What the chunk must be, and its new generation.
+        Expected identity of the chunk, with its new generation.
     path
-        What errors call the file.
+        Name of the file in error messages.
 
     Raises
     ------
     MapDataError
-        It is not the file of this chunk, or was cut or changed.
+        The file is not that of this chunk, or was truncated or changed.
     PackageMissing
         The package for its codec is not installed.
     """

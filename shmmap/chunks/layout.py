@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A chunk in shared memory: one header page, then its bricks.  ``CHUNKS.md`` is the byte-exact document.
+"""A chunk in shared memory: one header page, then its bricks.  ``CHUNKS.md`` is the byte-exact specification.
 
-The header's beginning says what the chunk is and never changes; it has a checksum.  The rest changes with
-every scan, and is true together with the bricks whenever ``sequence`` is even and the same before and after
-it was read.  Bricks lie in the order in which they were first touched; the brick index at the end of the
-header says where.  A chunk grows until it is given up, and then there is nothing in it.
+The first part of the header identifies the chunk, never changes, and has a checksum.  The rest changes with
+every scan.  A read of it and of the bricks is consistent if ``sequence`` was even and the same before and
+after the read.  Bricks are stored in the order in which they were first touched; the brick index at the end
+of the header has their positions.  A chunk grows until it is evicted, and is then truncated to nothing.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ __all__ = [
 
 CHUNKS_VERSION: Final = (2, 0)
 MAJORS_READ: Final = (1, 2)
-"""Versions with the same bytes; a daemon of version 1 did not truncate chunks that left memory."""
+"""Readable major versions, with the same layout; a daemon of version 1 did not truncate evicted chunks."""
 HEADER_BYTES: Final = 4096
 BRICK_BYTES: Final = 2 * BRICK_VOXELS
 MAX_BYTES: Final = HEADER_BYTES + BRICKS * BRICK_BYTES
 MAPPERS: Final = 32
-"""Mappers whose last scan a chunk remembers."""
+"""Number of mappers whose last scan a chunk remembers."""
 OUT_OF_SERVICE: Final = 1
-"""Value of ``state``, 0 in service: such a chunk changes no more, and another one may have its key."""
+"""Value of ``state`` (0: in service) of a chunk that no longer changes; a new chunk may have its key."""
 
 MAGIC: Final = b"SHMCHUNK"
 BYTE_ORDER: Final = 0x01020304
@@ -77,22 +77,21 @@ STATE: Final = np.dtype(
 
 
 class ChunkIdentity(msgspec.Struct, frozen=True):
-    """What a chunk is, for as long as it exists.
+    """The constant properties of a chunk.
 
     Attributes
     ----------
     map_id
-        16 bytes: which map, by the number it was given when it was made.
+        Id of the map, 16 bytes, chosen when the map was created.
     key
-        Which of its chunks.
+        Key of the chunk in the map.
     resolution
         Edge of a voxel, metres.
     clamp_min, clamp_max, occupied_above, free_below
-        Log-odds in thousandths: all voxels lie between the first two; those beyond the others count as
-        occupied and as free.
+        Log-odds in thousandths: bounds of all voxels, and the thresholds of occupied and free voxels.
     generation
-        Rises each time that this map's worker brings a chunk into memory: the same key in an older generation
-        is another chunk.
+        Increases each time that this map's worker loads a chunk into memory: the same key with an older
+        generation is another chunk.
     frame_id
         Frame of the map, at most 40 bytes of UTF-8.
     """
@@ -109,12 +108,12 @@ class ChunkIdentity(msgspec.Struct, frozen=True):
 
 
 def new_header(identity: ChunkIdentity) -> bytearray:
-    """Return the header of a chunk in which nothing is known yet.
+    """Return the header of an empty chunk.
 
     Raises
     ------
     ValueError
-        The frame's name is longer than 40 bytes, or the map's number not 16.
+        The frame's name is longer than 40 bytes, or the map's id is not 16 bytes.
     """
     frame = identity.frame_id.encode()
     if len(frame) > MAX_FRAME_BYTES or len(identity.map_id) != 16:
@@ -137,12 +136,12 @@ def read_identity(page: bytes | bytearray | memoryview, name: str = "chunk") -> 
     page
         At least the first 128 bytes.
     name
-        What errors call it.
+        Name in error messages.
 
     Raises
     ------
     SegmentCorrupt
-        It is not the header of a chunk, or of another major version, or its checksum is wrong.
+        The page is not the header of a chunk, has another major version, or has a wrong checksum.
     """
     if len(page) < STATE_AT:
         raise SegmentCorrupt(f"{name}: {len(page)} bytes are too few for the header of a chunk")
@@ -188,9 +187,9 @@ class ChunkView:
     state
         The changing part of the header, fields as in `STATE`: a zero-dimensional structured array.
     index
-        (1024,) uint16: where each brick lies, 0 for none, n for the n-th after the header.
+        (1024,) uint16: position of each brick, 0 for none, n for the n-th after the header.
     bricks
-        (N, 256) int16: log-odds in thousandths, bricks in the order in which they lie; N as the bytes allow.
+        (N, 256) int16: log-odds in thousandths, bricks in storage order; N is as many as fit into the bytes.
     """
 
     def __init__(self, data: Any) -> None:
@@ -202,11 +201,11 @@ class ChunkView:
 
     @property
     def identity(self) -> ChunkIdentity:
-        """What the chunk is; raises as `read_identity`."""
+        """Identity of the chunk; raises as `read_identity`."""
         return read_identity(self.data[:STATE_AT])
 
     def at(self, places: NDArray[np.integer]) -> NDArray[np.int16]:
-        """Voxels by their places in the chunk, (N,): 0 where nothing is known."""
+        """Return voxels by their places in the chunk, (N,); 0 for unknown voxels."""
         numbers = self.index[places >> 8].astype(np.intp)  # of bricks, which have 256 voxels
         found = np.zeros(len(numbers), np.int16)
         known = np.flatnonzero(numbers)
@@ -214,7 +213,7 @@ class ChunkView:
         return found
 
     def dense(self) -> NDArray[np.int16]:
-        """All voxels by their place in the chunk, (262144,): 0 where nothing is known."""
+        """Return all voxels by their place in the chunk, (262144,); 0 for unknown voxels."""
         full = np.zeros((BRICKS, BRICK_VOXELS), np.int16)
         there = np.flatnonzero(self.index)
         full[there] = self.bricks[self.index[there].astype(np.intp) - 1]
@@ -227,7 +226,7 @@ def check_consistent(view: ChunkView, name: str = "chunk") -> None:
     Raises
     ------
     SegmentCorrupt
-        They do not; also where a voxel lies beyond the clamps.
+        They contradict each other, or a voxel lies beyond the clamps.
     """
     identity, state = view.identity, view.state
     count = int(state["bricks"])

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A scan becomes marks: the voxels that its rays end in are hit, those on the way are passed through.
+"""Turn a scan into marks: voxels in which its rays end are hit, voxels along the rays are passed through.
 
-Each voxel counts once a scan, and as hit if any ray ends in it, whatever the order of the points.  A ray that
-is longer than the greatest range is cut there, and ends in nothing.  To each voxel one ray is cast, from the
-sensor's; the walk is Bonxai's.  (Bonxai lets what comes first in a scan decide between a hit and the end of
-a ray that was cut; here it is the hit.)
+Each voxel counts once per scan, and as hit if any ray ends in it, whatever the order of the points.  A ray
+that is longer than the maximum range is cut there, and hits nothing.  One ray is cast from the sensor's voxel
+to each end voxel; the traversal is Bonxai's.  (If a voxel is both a hit and the end of a cut ray, in Bonxai
+the first of them in the scan decides; here the hit does.)
 """
 
 from __future__ import annotations
@@ -27,23 +27,23 @@ __all__ = ["Marker"]
 
 FIRST_SLOTS: Final = 64
 MAX_REACH: Final = 64
-"""Chunks from the sensor to the end of the longest ray; the window's table is then 9 MB."""
+"""Most chunks from the sensor to the end of the longest ray; the window's table then has 9 MB."""
 
 
 class Marker:
-    """Marks scans, and keeps the memory that takes.
+    """Marks scans, and reuses the memory needed for that.
 
     Parameters
     ----------
     resolution
         Edge of a voxel, metres.
     scan_filter
-        Which points count.
+        Selects the points to use.
 
     Raises
     ------
     ConfigError
-        The greatest range is more than 64 chunks of 64 voxels.
+        The maximum range is more than 64 chunks of 64 voxels.
     """
 
     def __init__(self, resolution: float, scan_filter: ScanFilter | None = None) -> None:
@@ -75,16 +75,16 @@ class Marker:
         Parameters
         ----------
         points
-            (N, 3) float32 or float64, metres in the sensor's frame; those that are masked or not finite are
-            left out.
+            (N, 3) float32 or float64, metres in the sensor's frame; masked and non-finite points are left
+            out.
         pose
             (3, 4) or (4, 4): rotation and position of the sensor in the map's frame.
 
         Raises
         ------
         BadRequest
-            A shape is wrong, the pose is not a rotation and a finite position, the sensor is further away
-            than voxels reach, or the scan touches more than 4096 chunks.
+            A shape is wrong, the pose is not a rotation with a finite position, the sensor is outside the
+            range of voxel indices, or the scan touches more than 4096 chunks.
         """
         points = _numbers("points", points)
         if points.ndim != 2 or points.shape[1] != 3:
@@ -117,7 +117,7 @@ class Marker:
         self, points: NDArray[np.floating], pose: NDArray[np.float64], corner: NDArray[np.int64],
         sensor: NDArray[np.int64],
     ) -> ScanCounts | None:  # fmt: skip
-        """Mark, if there are slots enough."""
+        """Mark a scan; return None if there are too few slots."""
         wanted, counts = self.filter, np.zeros(5, np.int64)
         limits = np.array(
             [1.0 / self.resolution, wanted.min_range, wanted.max_range, wanted.min_z, wanted.max_z]
@@ -138,7 +138,7 @@ class Marker:
         self._used[0] = 0
 
     def _collect(self, corner: NDArray[np.int64]) -> Marks:
-        """Give what was marked as lists, chunks in the order of their keys, and forget it."""
+        """Return the marks as lists, chunks in the order of their keys, and clear them."""
         used = int(self._used[0])
         counts = np.zeros((used, 2), np.int32)
         total = kernels.count_words(used, self._hits, self._misses, counts)
@@ -156,7 +156,7 @@ class Marker:
 
 
 def _numbers(what: str, values: ArrayLike) -> NDArray[np.floating]:
-    """Real numbers as float32 where they are that, else as float64; NaN where an element is masked."""
+    """Return real numbers as float32 if they are float32, else as float64; masked elements become NaN."""
     try:
         array = np.asanyarray(values)
         if array.dtype.kind not in "fiu":

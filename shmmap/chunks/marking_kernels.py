@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compiled: which voxels a scan hits and passes through.
+"""Compiled kernels that find the voxels that a scan hits and passes through.
 
-Voxels are counted from the corner of a window of chunks around the sensor.  The sum of a voxel's three
-``codes``, one an axis, is its place in its chunk in the lower 18 bits, and above them which of the window's
-chunks that is.  ``table`` says which slot of the bit sets each chunk of the window has, -1 for none yet.
-Both bit sets, (slots * 4096,), have a bit for each voxel of each slot, by its place in the chunk.
+Voxel indices are relative to the corner of a window of chunks around the sensor.  The sum of a voxel's three
+``codes``, one per axis, has its place in its chunk in the lower 18 bits, and the chunk's number in the window
+above them.  ``table`` maps each chunk of the window to its slot in the bit sets, -1 for none yet. Both bit
+sets, (slots * 4096,), have a bit for each voxel of each slot, by its place in the chunk.
 
-The work on each point or voxel is written out in the loop.  In an inlined function, numba would count the
-references to the arrays at each call, which takes ten times as long as all else.
+The work on each point or voxel is written directly in the loop.  For an inlined function, numba would count
+references to the arrays at each call, which takes ten times as long as all other work.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ _NO_CHUNK: Final = np.uint64(2**40)
 _POINT: Final = np.uint64(32)
 _HALF: Final = 2**31
 _BLOCK: Final = 1024
-"""Points of which it is said together where they are: so the processor does several at a time."""
+"""Points that are classified together, so that the compiler can use vector instructions."""
 _NEAR, _FAR, _TOO_NEAR, _OUTSIDE_Z, _NOT_FINITE = range(5)
-"""What counts of a point, in the order of `mark_ends`'s ``counts``."""
+"""Classes of points, in the order of ``counts`` of `mark_ends`."""
 
 
 def window_codes(side: int) -> NDArray[np.uint64]:
-    """Return codes, (3, side * 64), of the voxels along each axis of a window with ``side`` chunks a side."""
+    """Return codes, (3, side * 64), of the voxels along each axis of a window of ``side`` chunks per axis."""
     voxels = np.arange(side * CHUNK_SIDE)
     chunks, within = voxels >> CHUNK_SHIFT, voxels & (CHUNK_SIDE - 1)
     places = (PLACE_X, PLACE_Y, PLACE_Z)
@@ -55,12 +55,12 @@ def window_codes(side: int) -> NDArray[np.uint64]:
 def _place_points(
     points: Any, begin: Any, size: Any, pose: Any, limits: Any, corner: Any, near: Any, place: Any
 ) -> None:
-    """Find which of some points count, and the voxels in which their rays end, without branches."""
+    """Classify a block of points, and find the voxels in which their rays end, without branches."""
     inverse, low_z, high_z = limits[0], limits[3], limits[4]
     nearest, furthest = limits[1] * limits[1], limits[2] * limits[2]
     from_x, from_y, from_z = pose[0, 3], pose[1, 3], pose[2, 3]
     for n in range(size):
-        # without this a float32 stays one, and points on a voxel's border fall elsewhere
+        # otherwise a float32 stays one, and points on a voxel's border get other voxels
         px = np.float64(points[begin + n, 0])
         py = np.float64(points[begin + n, 1])
         pz = np.float64(points[begin + n, 2])
@@ -99,27 +99,27 @@ def mark_ends(
     points: Any, pose: Any, limits: Any, corner: Any, codes: Any, table: Any, used: Any, most: Any, hits: Any,
     misses: Any, ends: Any, counts: Any,
 ) -> Any:  # fmt: skip
-    """Mark where rays end, those in range before those that are cut short; each voxel once.
+    """Mark the ends of rays, first those in range, then those that are cut; each voxel once.
 
     Parameters
     ----------
     points, pose
-        (N, 3) in the sensor's frame, and (3, 4): how they lie in the map's.
+        Points, (N, 3) in the sensor's frame, and the sensor's pose in the map's frame, (3, 4).
     limits
-        ``1 / resolution``, least and greatest range, least and greatest z (of the sensor's frame).
+        ``1 / resolution``, minimum and maximum range, minimum and maximum z (in the sensor's frame).
     corner
         Index of the window's first voxel along x, y, z.
     table, used, most
-        Slots; ``used[0]`` is how many are, then which chunk each is for.
+        Slots of chunks; ``used[0]`` is the number of used slots, followed by the chunk of each.
     ends
-        (N, 3), as long as ``points``: receives the voxels to which rays are to be cast.
+        (N, 3), as long as ``points``: receives the voxels to which rays are cast.
     counts
-        Receives how many points are in range, too far, too near, too high or low, not finite.
+        Receives the numbers of points in range, too far, too near, outside the heights, and not finite.
 
     Returns
     -------
     int
-        How many ``ends`` there are, `NO_SLOTS` if there are too few slots.
+        Number of ``ends``; `NO_SLOTS` if there are too few slots.
     """
     rays, cut = 0, ends.shape[0]
     near, place = np.empty(_BLOCK, np.uint8), np.empty((3, _BLOCK), np.int32)
@@ -136,7 +136,7 @@ def mark_ends(
                 cut -= 1
                 ends[cut, 0], ends[cut, 1], ends[cut, 2] = place[0, n], place[1, n], place[2, n]
     first, end, rays = 0, rays, 0
-    for which in (hits, misses):  # where a ray is cut is a miss, if nothing was hit there
+    for which in (hits, misses):  # the end of a cut ray is a miss, unless its voxel was hit
         for n in range(first, end):
             i, j, k = ends[n, 0], ends[n, 1], ends[n, 2]
             code = codes[0, i] + codes[1, j] + codes[2, k]
@@ -166,12 +166,13 @@ def mark_rays(
     ends: Any, count: Any, from_x: Any, from_y: Any, from_z: Any, codes: Any, table: Any, used: Any,
     most: Any, misses: Any,
 ) -> Any:  # fmt: skip
-    """Mark the voxels between the sensor's, included, and the ends, excluded.
+    """Mark the voxels from the sensor's voxel, included, to the ends, excluded.
 
-    The walk is Bonxai's ``RayIterator``: as many voxels as the longest axis, u, has steps.  Along v and w the
-    place has 32 bits behind the point, and half a step is added at the start: that is Bonxai's walk with its
-    errors as long as there are less than 2^15 steps, and no step waits for the one before.  A step back is
-    cut upwards where one forth is cut downwards.  Returns whether there were slots enough.
+    The traversal is Bonxai's ``RayIterator``: one voxel per step along the longest axis, u.  Positions along
+    v and w are fixed-point numbers with 32 fractional bits, starting with half a step added.  Up to 2^15
+    steps that gives the same voxels as Bonxai, including its rounding errors, and no step depends on the
+    previous one.  Negative steps are rounded up where positive steps are rounded down.  Returns whether there
+    were enough slots.
     """
     flat, side = codes.reshape(-1), codes.shape[1]
     for n in range(count):
@@ -240,16 +241,16 @@ def mark_rays(
 
 @compiled(types.int64(int64, uint64[::1], uint64[::1], int32[:, ::1]))
 def count_words(slots: Any, hits: Any, misses: Any, counts: Any) -> Any:
-    """Take hits out of the misses, and count the words of both that have bits.
+    """Remove hits from the misses, and count the non-zero words of both.
 
-    ``counts``, (slots, 2), receives them by slot.  Returns how many there are in all.
+    ``counts``, (slots, 2), receives the numbers by slot.  Returns the total.
     """
     words = 0
     for slot in range(slots):
         hit, miss = 0, 0
         begin, end = slot * WORDS, (slot + 1) * WORDS
         of_hits, of_misses = hits[begin:end], misses[begin:end]
-        for word in range(WORDS):  # nothing branches: so it takes a thirtieth of the time
+        for word in range(WORDS):  # without branches this takes a thirtieth of the time
             of_misses[word] &= ~of_hits[word]
             hit += of_hits[word] != 0
             miss += of_misses[word] != 0
@@ -260,7 +261,7 @@ def count_words(slots: Any, hits: Any, misses: Any, counts: Any) -> Any:
 
 @compiled(types.void(read_only(int64, 1), uint64[::1], uint64[::1], uint64[::1], uint16[::1]))
 def write_words(order: Any, hits: Any, misses: Any, bits: Any, words: Any) -> None:
-    """Write the words that have bits: slot by slot in ``order``, hits before misses; and clear the sets."""
+    """Write the non-zero words, slot by slot in ``order``, hits before misses; and clear the sets."""
     at = 0
     for slot in order:
         for which in (hits, misses):
@@ -275,6 +276,6 @@ def write_words(order: Any, hits: Any, misses: Any, bits: Any, words: Any) -> No
 
 @compiled(types.void(int64, uint64[::1], uint64[::1]))
 def clear(slots: Any, hits: Any, misses: Any) -> None:
-    """Forget what was marked."""
+    """Clear all marks."""
     hits[: slots * WORDS] = 0
     misses[: slots * WORDS] = 0

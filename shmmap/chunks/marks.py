@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Marks of one scan, as bytes: for each chunk the words with hits, then those with misses.
 
-``CHUNKS.md`` is the byte-exact document.  Decoding trusts nothing in the bytes.
+``CHUNKS.md`` is the byte-exact specification.  Decoding does not trust the bytes.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ __all__ = ["MARKS_VERSION", "MAX_CHUNKS", "Marks", "decode_marks", "encode_marks
 
 MARKS_VERSION: Final = (1, 0)
 MAX_CHUNKS: Final = 4096
-"""Chunks that one scan may touch."""
+"""Most chunks that one scan may touch."""
 
 _MAGIC: Final = b"SHMMARKS"
 _ORDER: Final = 0x01020304
@@ -32,17 +32,17 @@ _WORD_BYTES: Final = 10
 
 
 class Marks(msgspec.Struct, frozen=True, eq=False):
-    """The voxels that a scan hits, and those that it passes through, each in one of both.
+    """The voxels that a scan hits, and those that it passes through; no voxel is in both sets.
 
     Attributes
     ----------
     keys
         (C, 3) int32: the chunks touched, each once.
     hits, misses
-        (C,) uint32: how many words of each have voxels that are hit, and that are passed through.
+        (C,) uint32: number of words in each chunk with hit voxels, and with voxels passed through.
     bits, words
-        (W,) uint64 and uint16: of each word its 64 voxels, x fastest, the lowest bit first; and which of the
-        chunk's 4096 words it is.  Chunk by chunk as in ``keys``, hits before misses, rising in each.
+        (W,) uint64 and uint16: the 64 voxels of each word, x fastest, lowest bit first; and the word's number
+        in its chunk, of 4096.  Ordered by chunk as in ``keys``, hits before misses, then by number.
     """
 
     keys: NDArray[np.int32]
@@ -58,7 +58,7 @@ class Marks(msgspec.Struct, frozen=True, eq=False):
 
     @property
     def starts(self) -> NDArray[np.int64]:
-        """(C + 1,): where the words of each chunk begin."""
+        """Index of each chunk's first word, and the total, (C + 1,)."""
         ends = np.cumsum(self.hits.astype(np.int64) + self.misses.astype(np.int64))
         return np.concatenate(([0], ends))
 
@@ -74,9 +74,9 @@ def encode_marks(marks: Marks, map_id: bytes, mapper: int, scan: int) -> bytes:
     Parameters
     ----------
     map_id
-        16 bytes: the map they are for.
+        Id of the map, 16 bytes.
     mapper, scan
-        The number that the daemon gave the mapper, and that of its scan.
+        The mapper's number from the daemon, and the scan's number.
     """
     rows = np.zeros(len(marks.keys), _ROW)
     rows["key"], rows["hits"], rows["misses"] = marks.keys, marks.hits, marks.misses
@@ -93,12 +93,12 @@ def decode_marks(data: bytes | memoryview, map_id: bytes, mapper: int, scan: int
     data
         Memory that no other process writes to.
     map_id, mapper, scan
-        What they must be for.
+        Expected map, mapper and scan.
 
     Raises
     ------
     BadRequest
-        They are for something else, or do not say what marks say: the message names what.
+        The marks are for another map, mapper or scan, or are invalid; the message contains the reason.
     """
     if len(data) < _HEADER.size:
         raise BadRequest(f"marks: {len(data)} bytes are too few for their header")

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which points of a scan count, what a hit and a miss are worth, and which voxels are occupied or free.
+"""Occupancy model: selection of points, log-odds of hits and misses, thresholds of occupied and free.
 
-A voxel holds log-odds in thousandths, ``int16(1000 * ln(p / (1 - p)))`` cut towards zero, between two clamps;
-0 is *unknown*.  A hit adds, a miss takes away (Bonxai's ``ProbabilisticMap`` has the same in millionths).  A
-known voxel whose evidence comes to exactly 0 is unknown again.
+A voxel holds log-odds in thousandths, ``int16(1000 * ln(p / (1 - p)))`` truncated towards zero, between two
+clamps; 0 is *unknown*.  A hit adds, a miss subtracts (Bonxai's ``ProbabilisticMap`` does the same in
+millionths).  A known voxel whose evidence becomes exactly 0 is unknown again.
 """
 
 from __future__ import annotations
@@ -19,37 +19,38 @@ __all__ = ["UNIT", "Occupancy", "ScanCounts", "ScanFilter", "log_odds", "probabi
 
 UNIT: Final = 1000
 NEAREST: Final = 1e-9
-"""Probabilities nearer to 0 and 1 than this have log-odds that do not fit."""
+"""Minimum distance of a probability from 0 and 1; beyond that its log-odds do not fit."""
 
 
 def log_odds(probability: float) -> int:
-    """Return log-odds in thousandths, cut towards zero."""
+    """Return log-odds in thousandths, truncated towards zero."""
     return int(UNIT * math.log(probability / (1.0 - probability)))
 
 
 def probability(log_odds: float) -> float:
-    """Return the probability that log-odds in thousandths stand for."""
+    """Return the probability for log-odds in thousandths."""
     return 1.0 / (1.0 + math.exp(-log_odds / UNIT))
 
 
 class Occupancy(msgspec.Struct, frozen=True):
-    """How evidence is added up, fixed when a map is made; all are probabilities.
+    """Parameters of the occupancy update, fixed when a map is created; all are probabilities.
 
     The defaults are those of Rolling-Bonxai's parameter file.
 
     Attributes
     ----------
     hit, miss
-        What one hit and one miss say: above and below a half.
+        Probability of occupancy after one hit (above a half) and one miss (below a half).
     clamp_min, clamp_max
-        No voxel is surer than this.  (Rolling-Bonxai calls them ``m_occupancy_min_thresh`` and ``max``.)
+        Bounds of every voxel's probability.  (Rolling-Bonxai calls them ``m_occupancy_min_thresh`` and
+        ``max``.)
     occupied_above, free_below
-        Voxels beyond these count as occupied and as free.
+        Thresholds above which a voxel counts as occupied, and below which as free.
 
     Raises
     ------
     ConfigError
-        One is no probability, or on the wrong side of a half, or a step comes to nothing.
+        A value is no probability, is on the wrong side of a half, or makes a hit or miss add nothing.
     """
 
     hit: float = 0.7
@@ -85,12 +86,12 @@ class Occupancy(msgspec.Struct, frozen=True):
 
     @property
     def thresholds(self) -> tuple[int, int]:
-        """A voxel above the first is occupied, one below the second is free; log-odds in thousandths."""
+        """Log-odds above which a voxel is occupied, and below which it is free, thousandths."""
         return log_odds(self.occupied_above), log_odds(self.free_below)
 
 
 class ScanFilter(msgspec.Struct, frozen=True):
-    """Which points of a scan count; metres, in the sensor's frame.
+    """Selects the points of a scan to use; metres, in the sensor's frame.
 
     The defaults are those of Rolling-Bonxai's parameter file.
 
@@ -104,7 +105,7 @@ class ScanFilter(msgspec.Struct, frozen=True):
     Raises
     ------
     ConfigError
-        Nothing lies between two of them, or one is no finite number.
+        A minimum is not below its maximum, or a value is not a finite number.
     """
 
     min_range: float = 0.5
@@ -126,7 +127,7 @@ class ScanFilter(msgspec.Struct, frozen=True):
 
 
 class ScanCounts(msgspec.Struct, frozen=True):
-    """Points of a scan in range, cut at the greatest range, and left out for each reason."""
+    """Numbers of points of a scan: in range, cut at the maximum range, and left out for each reason."""
 
     near: int
     far: int

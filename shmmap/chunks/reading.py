@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read chunks while they are written: a consistent copy, and the voxels in it.
 
-A reader copies a chunk by `os.pread`, and the copy counts if the chunk's ``sequence`` was even and the same
-before and after.  On x86 the processor keeps the order of reads; elsewhere a barrier of the kernel does.
+A reader copies a chunk by `os.pread`; the copy is valid if the chunk's ``sequence`` was even and the same
+before and after.  On x86 the processor keeps the order of reads; elsewhere a barrier in the kernel does.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ __all__ = ["KINDS", "read_chunk", "select_voxels", "sequence_of"]
 
 KINDS: Final = ("occupied", "free")
 TRIES: Final = 1000
-"""A writer takes 40 us for a chunk; one that died meanwhile leaves the sequence odd until the next comes."""
+"""Tries for one copy: a write takes 40 us, but after a writer's death the sequence may stay odd."""
 
 _SEQUENCE: Final = struct.Struct("<Q")
 _MEMBARRIER: Final = {"aarch64": 283, "riscv64": 283, "armv7l": 389, "ppc64le": 365}
@@ -47,12 +47,12 @@ _fence: Final = _barrier()
 
 
 def sequence_of(fd: int, name: str = "chunk") -> int:
-    """Return the ``sequence`` of an open chunk: a copy of it is up to date as long as this is the same.
+    """Return the ``sequence`` of an open chunk: a copy is current as long as this does not change.
 
     Raises
     ------
     StaleHandle
-        The chunk was given up.
+        The chunk was evicted.
     """
     data = os.pread(fd, _SEQUENCE.size, STATE_AT)
     if len(data) < _SEQUENCE.size:
@@ -62,27 +62,27 @@ def sequence_of(fd: int, name: str = "chunk") -> int:
 
 
 def read_chunk(fd: int, name: str = "chunk") -> ChunkView | None:
-    """Read a chunk as it was at one moment.
+    """Read a consistent copy of a chunk.
 
     Parameters
     ----------
     fd
-        Its file, open for reading.  (Only the writer maps a chunk: its file is cut to nothing when it
-        is given up.)
+        The chunk's file, open for reading.  (Only the writer maps a chunk, since the file is truncated to
+        nothing when the chunk is evicted.)
     name
-        What errors call it.
+        Name in error messages.
 
     Returns
     -------
     ChunkView
-        Over memory of its own; None if the writer kept changing it, or died while it did.
+        The copy; None if the writer kept changing the chunk, or died during a change.
 
     Raises
     ------
     StaleHandle
-        The chunk was given up.
+        The chunk was evicted.
     SegmentCorrupt
-        It says that it has more bricks than its file, or than a chunk can have.
+        The header states more bricks than the file contains, or than a chunk can have.
     OSError
         The file cannot be read.
     """
@@ -122,14 +122,14 @@ def select_voxels(view: ChunkView, kind: str) -> tuple[NDArray[np.int32], NDArra
     Returns
     -------
     indices
-        (N, 3) int32, of voxels.
+        Indices of the voxels, (N, 3) int32.
     log_odds
         (N,) int16, in thousandths.
 
     Raises
     ------
     BadRequest
-        There is no such kind.
+        The kind is unknown.
     """
     identity = view.identity
     cells = view.bricks[: int(view.state["bricks"])]
@@ -147,7 +147,7 @@ def select_voxels(view: ChunkView, kind: str) -> tuple[NDArray[np.int32], NDArra
 
 
 def _place_of_bricks(view: ChunkView) -> NDArray[np.int64]:
-    """Return the place of each brick among the chunk's 1024, in the order in which bricks lie."""
+    """Return the place of each brick among the chunk's 1024, in storage order."""
     there = np.flatnonzero(view.index)
     places = np.zeros(int(view.state["bricks"]), np.int64)
     places[view.index[there].astype(np.intp) - 1] = there

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where voxels lie: a point's voxel, a voxel's chunk, and its place in the chunk.
+"""Indexing of voxels: a point's voxel, a voxel's chunk, and its place in the chunk.
 
-A voxel is named by three whole numbers, ``floor(x * (1 / resolution))`` along each axis, computed in double
+A voxel is identified by three integers, ``floor(x * (1 / resolution))`` along each axis, computed in double
 precision (as Bonxai's ``VoxelGrid::posToCoord``).  A *chunk* is a cube of 64 voxels a side; its key is the
 voxel's index shifted right by 6 bits, which is the same for negative indices.  A chunk consists of *bricks*
 of 8 x 8 x 4 voxels, and a brick of four *words* of 8 x 8 x 1: the unit of marks.
@@ -46,13 +46,13 @@ CHUNK_VOXELS: Final = BRICKS * BRICK_VOXELS
 WORDS: Final = CHUNK_VOXELS // 64
 """Words of a chunk: 64 voxels of equal z each, x fastest."""
 FURTHEST_INDEX: Final = 1 << 30
-"""Voxels have indices from minus this up to this less one: half of what a chunk key could name."""
+"""Voxel indices are at least minus this and less than this: half of the range of chunk keys."""
 FURTHEST_SENSOR: Final = FURTHEST_INDEX // 2
-"""Sensors and readers are nearer to the map's origin: what they see has to have indices, too."""
+"""Bound of sensors' and readers' indices, so that the voxels that they see have indices, too."""
 
 
 class ChunkKey(NamedTuple):
-    """Which chunk: its voxels' indices shifted right by 6 bits."""
+    """Key of a chunk: its voxels' indices shifted right by 6 bits."""
 
     x: int
     y: int
@@ -60,7 +60,7 @@ class ChunkKey(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The key as it stands in the names of segments and files: ``3_-1_0``."""
+        """The key as in the names of segments and files: ``3_-1_0``."""
         return f"{self.x}_{self.y}_{self.z}"
 
     @classmethod
@@ -70,7 +70,7 @@ class ChunkKey(NamedTuple):
         Raises
         ------
         BadRequest
-            It is not three whole numbers, as `text` writes them.
+            The text is not three integers in the form of `text`.
         """
         try:
             x, y, z = map(int, text.split("_"))
@@ -83,13 +83,13 @@ class ChunkKey(NamedTuple):
 
     @property
     def possible(self) -> bool:
-        """Whether voxels have such indices."""
+        """Whether the chunk lies within the range of voxel indices."""
         most = FURTHEST_INDEX >> CHUNK_SHIFT
         return all(-most <= part < most for part in self)
 
     @property
     def first_voxel(self) -> tuple[int, int, int]:
-        """Index of its lowest voxel."""
+        """Index of the chunk's lowest voxel."""
         return self.x << CHUNK_SHIFT, self.y << CHUNK_SHIFT, self.z << CHUNK_SHIFT
 
     def box(self, resolution: float) -> tuple[float, float, float, float, float, float]:
@@ -116,12 +116,12 @@ PLACE_Z: Final = _table([(z >> 2) * 64 * BRICK_VOXELS + (z & 3) * 64 for z in ra
 
 
 def voxel_indices(xyz: NDArray[np.floating], resolution: float) -> Indices:
-    """Voxels that points, (N, 3) metres, lie in, as (N, 3).
+    """Return the indices, (N, 3), of the voxels that contain points, (N, 3) metres.
 
     Raises
     ------
     BadRequest
-        A coordinate is not finite, or further away than indices reach.
+        A coordinate is not finite, or outside the range of indices.
     """
     scaled = np.floor(np.asarray(xyz, dtype=np.float64) * (1.0 / resolution))
     if not (np.abs(scaled + 0.5) < FURTHEST_INDEX).all():  # also false for NaN
@@ -131,13 +131,13 @@ def voxel_indices(xyz: NDArray[np.floating], resolution: float) -> Indices:
 
 
 def voxel_centers(indices: NDArray[np.integer], resolution: float) -> NDArray[np.float64]:
-    """Middles of voxels, (N, 3) metres."""
+    """Return the centres of voxels, (N, 3) metres."""
     centers: NDArray[np.float64] = (np.asarray(indices, dtype=np.float64) + 0.5) * resolution
     return centers
 
 
 def in_chunk(indices: Indices) -> tuple[Indices, Indices]:
-    """Chunk keys, (N, 3), of voxels, and their places in them, (N,)."""
+    """Return the chunk keys of voxels, (N, 3), and their places in the chunks, (N,)."""
     low = indices & (CHUNK_SIDE - 1)
     places: Indices = PLACE_X[low[:, 0]] + PLACE_Y[low[:, 1]] + PLACE_Z[low[:, 2]]
     return indices >> CHUNK_SHIFT, places

@@ -153,7 +153,7 @@ def given_intent(
     Raises
     ------
     BadRequest
-        There is a velocity, a heading or a route without a pose, or one of them makes no sense.
+        There is a velocity, a heading or a route without a pose, or one of them is invalid.
     """
     if pose is None:
         if heading is not None or len(route) or tuple(velocity) != (0.0, 0.0):

@@ -29,7 +29,7 @@ class PendingLayer(NamedTuple):
 
 
 class CellSet(Sequence[Cell]):
-    """The cells that answer a request, in reply order, and what is missing among them.
+    """The cells that answer a request, in reply order, and the cells that are missing.
 
     It is a sequence of its cells.
 
@@ -38,13 +38,13 @@ class CellSet(Sequence[Cell]):
     cells : tuple of Cell
         Attached cells; of a differential request only the new and changed ones.
     failed : tuple of CellError
-        Cells that cannot be loaded; the others are good all the same.
+        Cells that cannot be loaded; the other cells are not affected.
     pending : tuple of PendingLayer
         Cells still being loaded when the wait was over: ask again.
     removed : tuple of str
         Held ids that left the area or the map, in the order they were given.
     epoch : int
-        Which run of the daemon answered.
+        Identifier of the daemon run that answered.
     map_version : int
         State of the map that the reply describes.
     layers : tuple of str

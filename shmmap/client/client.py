@@ -116,7 +116,7 @@ class Client:
 
     @property
     def timeout(self) -> float:
-        """Seconds a reply may take, beyond what a request lets the daemon wait."""
+        """Seconds a reply may take, in addition to the time that the request lets the daemon wait."""
         return self._session.timeout_s
 
     @property
@@ -184,7 +184,7 @@ class Client:
         wait: float | None = DEFAULT_WAIT_S,
         strict: bool | None = False,
     ) -> CellSet:
-        """Cells within ``radius`` metres of a place, whole: `area` with a circle."""
+        """Return the cells that touch a circle of ``radius`` metres, as whole cells; `area` with a circle."""
         return self.area(geometry.Circle(x, y, radius, z), layers, wait=wait, strict=strict)
 
     def area(
@@ -199,7 +199,7 @@ class Client:
         route: Sequence[tuple[float, float]] | NDArray[Any] = (),
         strict: bool | None = False,
     ) -> CellSet:
-        """Cells that touch an area, in id order.
+        """Return the cells that touch an area, in id order.
 
         A `ShmmapWarning` reports an incomplete answer: cells failed, cells are still being loaded after
         ``wait``, or there are no cells at all.
@@ -253,7 +253,7 @@ class Client:
         wait: float | None = DEFAULT_WAIT_S,
         strict: bool | None = False,
     ) -> PointsAround:
-        """Points within ``radius`` metres of a place, as views of the cells they lie in; nothing is copied.
+        """Return the points within ``radius`` metres of a place, as views of their cells; nothing is copied.
 
         `around` returns whole cells, which reach beyond the circle; `PointsAround.gather`, ``mask`` and
         ``count`` select the points within it.  `PointsAround.covered` is True if these are all points that
@@ -293,7 +293,7 @@ class Client:
         timeout: float | None = None,
         strict: bool | None = False,
     ) -> CellSet:
-        """Cells that touch an area, minus those that are held at their current version.
+        """Return the cells that touch an area, minus those that are held at their current version.
 
         Drop the cells that `CellSet.removed` lists before adding the new ones.  A cell whose version changed
         is returned, but not listed as removed.
@@ -337,7 +337,7 @@ class Client:
         route: Sequence[tuple[float, float]] | NDArray[Any] = (),
         strict: bool | None = False,
     ) -> CellSet:
-        """Cells by id, in the order asked for, duplicates preserved.
+        """Return cells by id, in the requested order, with duplicates.
 
         An id is the absolute path of the cell's file, or its base name where that is unique.  Other
         parameters and errors are those of `area`.

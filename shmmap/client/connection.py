@@ -76,7 +76,7 @@ class Connection:
     Attributes
     ----------
     welcome : Welcome
-        What the daemon said about itself when the session began.
+        Description of the daemon, as received when the session began.
     path : str
         Path at which the daemon listens.
 
@@ -142,7 +142,7 @@ class Connection:
         timeout_s
             How long the reply may take.
         quiet_s
-            How long the daemon was asked to wait, during which silence means nothing.
+            How long the request lets the daemon wait, during which silence is normal.
 
         Raises
         ------

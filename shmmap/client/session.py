@@ -48,7 +48,7 @@ class Session:
     paths
         Socket paths to try, in order.
     timeout_s
-        How long a reply may take, beyond what a request lets the daemon wait.
+        How long a reply may take, in addition to the time that the request lets the daemon wait.
     connect_timeout_s
         How long `Welcome` may take.
     name

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A process that ends with the one it works for.
+"""Make a process end together with its parent.
 
-``python -m shmmap.processes.end_with_parent PARENT COMMAND...`` runs a command that gets SIGTERM when process
-PARENT ends, however it ends.
+``python -m shmmap.processes.end_with_parent PARENT COMMAND...`` runs a command that receives SIGTERM when
+process PARENT ends, for whatever reason.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ def die_with(parent: int, number: signal.Signals = signal.SIGKILL) -> None:
     if libc.prctl(_PR_SET_PDEATHSIG, number, 0, 0, 0) != 0:
         raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG) failed")
     if os.getppid() != parent:
-        os._exit(0)  # it was gone before the kernel knew that we care
+        os._exit(0)  # the parent ended before the signal was set up
 
 
 def with_us() -> list[str]:
-    """Return what to write before a command that must not outlive this process."""
+    """Return the words to put before a command that must not outlive this process."""
     return [sys.executable, "-m", "shmmap.processes.end_with_parent", str(os.getpid())]
 
 

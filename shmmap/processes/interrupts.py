@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ctrl-C at the wrong moment: held back while a process is started or something is cleaned up."""
+"""Hold back Ctrl-C while a process is started or a cleanup runs."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from typing import Final
 __all__ = ["ENDINGS", "interrupts_later", "scratch_directory", "signals_interrupt"]
 
 ENDINGS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""Signals by which people and systems end a program."""
+"""Signals by which users and the system end a program."""
 
 
 @contextlib.contextmanager
 def interrupts_later() -> Iterator[None]:
     """Hold back signals that end the program until the block is done.
 
-    An interrupt inside `subprocess.Popen` would lose the child it has just started.
+    An interrupt inside `subprocess.Popen` would leak the child that was just started.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -43,7 +43,7 @@ def interrupts_later() -> Iterator[None]:
 
 @contextlib.contextmanager
 def signals_interrupt() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP interrupt as Ctrl-C does; after the first, cleaning up is not interrupted."""
+    """Make SIGTERM and SIGHUP interrupt like Ctrl-C; after the first signal, cleanup is not interrupted."""
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         del number, frame
@@ -57,7 +57,7 @@ def signals_interrupt() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _handled_by(handle: Callable[[int, FrameType | None], None]) -> Iterator[None]:
-    """Handle these signals by a function, save one of a program in C, which Python cannot restore."""
+    """Handle `ENDINGS` by a function, except signals with a handler in C, which Python cannot restore."""
     before = {number: handler for number in ENDINGS if (handler := signal.getsignal(number)) is not None}
     try:
         for number in before:
@@ -66,7 +66,7 @@ def _handled_by(handle: Callable[[int, FrameType | None], None]) -> Iterator[Non
     finally:
         try:
             _put_back(before)
-        except BaseException:  # raised by a handler that is back: the others must come back, too
+        except BaseException:  # raised by a restored handler: the others must be restored, too
             _put_back(before)
             raise
 
@@ -78,7 +78,7 @@ def _put_back(handlers: Mapping[signal.Signals, Callable[[int, FrameType | None]
 
 @contextlib.contextmanager
 def scratch_directory(prefix: str) -> Iterator[str]:
-    """Make a temporary directory whose name begins so, and remove it with all it holds whatever happens."""
+    """Create a temporary directory with this name prefix, and remove it with its content in any case."""
     with interrupts_later():
         path = tempfile.mkdtemp(prefix=prefix)
     try:

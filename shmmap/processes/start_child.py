@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Starting a child: a process of its own or a fork of this one, with a channel of packets to it.
+"""Start a child, as a new process or a fork of this one, with a packet channel to it.
 
-Packets are received into one buffer that is there already: `socket.recv_fds` makes a new one of the largest
-packet's size for each, half a mebibyte that the kernel maps, and unmaps again.
+Packets are received into one preallocated buffer.  `socket.recv_fds` would allocate one of the largest
+packet's size for each packet: half a mebibyte that the kernel maps and unmaps.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ __all__ = [
 ]
 
 MAX_PACKET_BYTES: Final = 1 << 19
-"""A job may name its cell and 65 neighbours by paths of 4095 bytes each."""
+"""Largest packet: a job may name its cell and 65 neighbours by paths of 4095 bytes each."""
 
 _ONE_DESCRIPTOR: Final = socket.CMSG_LEN(array.array("i").itemsize)
 
 
 def channel() -> tuple[socket.socket, socket.socket]:
-    """Return both ends of a channel, the parent's first; each takes the longest packet there is."""
+    """Return both ends of a channel, the parent's first; each accepts packets of `MAX_PACKET_BYTES`."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     for end in (ours, theirs):
         end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, MAX_PACKET_BYTES)
@@ -49,24 +49,24 @@ def channel() -> tuple[socket.socket, socket.socket]:
 
 
 def packet_buffer() -> bytearray:
-    """Return a buffer that takes the largest packet; what was never written to costs no memory."""
+    """Return a buffer for the largest packet; pages that are never written cost no memory."""
     return bytearray(MAX_PACKET_BYTES)
 
 
 def receive_packet(channel: socket.socket, buffer: bytearray, *, wait: bool = True) -> tuple[memoryview, int]:
-    """Receive one packet, and the descriptor that came with it.
+    """Receive one packet, and the descriptor sent with it.
 
     Parameters
     ----------
     wait
-        False: `BlockingIOError` where there is none, whatever else the channel waits for.
+        False: raise `BlockingIOError` if there is no packet, even if the channel is blocking.
 
     Returns
     -------
     data
-        The packet, valid until the next one is received into ``buffer``; empty when the other end is closed.
+        The packet, valid until the next one is received into ``buffer``; empty if the other end is closed.
     fd
-        The descriptor, closed on exec; -1 for none.
+        The descriptor, close-on-exec; -1 for none.
 
     Raises
     ------
@@ -85,23 +85,23 @@ def receive_packet(channel: socket.socket, buffer: bytearray, *, wait: bool = Tr
 def start_child(
     module: str, *arguments: str, new_session: bool
 ) -> tuple[subprocess.Popen[bytes], socket.socket]:
-    """Start ``python -m MODULE CHANNEL_FD PARENT_PID ARGUMENT...``; Ctrl-C is the parent's to handle.
+    """Start ``python -m MODULE CHANNEL_FD PARENT_PID ARGUMENT...``; the parent handles Ctrl-C.
 
-    The child has SIGINT blocked from its first instruction on: else it could end in the middle of its
-    imports, with a traceback at the user's terminal.
+    The child has SIGINT blocked from its first instruction on.  Otherwise it could end during its imports,
+    with a traceback in the user's terminal.
 
     Parameters
     ----------
     module
-        It begins with `channel_to_parent`.
+        Module to run, which calls `channel_to_parent` first.
     *arguments
         Further arguments.
     new_session
-        Whether keys pressed at the parent's terminal are kept from it.
+        Whether to shield the child from signals of the parent's terminal.
 
     Returns
     -------
-    The process, and our end of the channel.
+    The process, and the parent's end of the channel.
     """
     ours, theirs = channel()
     try:
@@ -121,7 +121,7 @@ def start_child(
                 stdout=subprocess.DEVNULL,
                 env=environment,
                 start_new_session=new_session,
-                cwd="/",  # nothing is imported from where the parent happens to run
+                cwd="/",  # nothing is imported from the parent's working directory
             )
     except BaseException:
         ours.close()
@@ -130,14 +130,14 @@ def start_child(
 
 
 def channel_to_parent(arguments: Sequence[str]) -> socket.socket:
-    """Begin a child that `start_child` has started: return its end of the channel.
+    """Initialize a child of `start_child`, and return its end of the channel.
 
-    The kernel ends the child with its parent, and Ctrl-C is the parent's to handle.
+    The kernel kills the child when its parent ends, and the parent handles Ctrl-C.
 
     Parameters
     ----------
     arguments
-        Those of the child's program, which begin with ``CHANNEL_FD PARENT_PID``.
+        Arguments of the child's program, which begin with ``CHANNEL_FD PARENT_PID``.
     """
     die_with(int(arguments[1]))
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -145,18 +145,18 @@ def channel_to_parent(arguments: Sequence[str]) -> socket.socket:
 
 
 class ForkedProcess:
-    """A child made by `fork_child`, with what is used of `subprocess.Popen`."""
+    """A child of `fork_child`, with the needed part of `subprocess.Popen`'s interface."""
 
     def __init__(self, pid: int) -> None:
         self.pid = pid
 
     def kill(self) -> None:
-        """Kill it."""
+        """Kill the process."""
         with contextlib.suppress(ProcessLookupError):
             os.kill(self.pid, signal.SIGKILL)
 
     def wait(self, timeout: float) -> int:
-        """Return its exit code; `subprocess.TimeoutExpired` if it has not ended in time."""
+        """Return the process's exit code; raise `subprocess.TimeoutExpired` if it does not end in time."""
         pidfd = os.pidfd_open(self.pid)
         try:
             if not select.select([pidfd], [], [], timeout)[0]:
@@ -167,7 +167,7 @@ class ForkedProcess:
 
 
 def fork_child(main: Callable[[int, int], int]) -> tuple[ForkedProcess, socket.socket] | None:
-    """Start a child that has imported already what this process has, in a session of its own.
+    """Fork a child, which has this process's modules already, into a new session.
 
     Parameters
     ----------
@@ -177,13 +177,13 @@ def fork_child(main: Callable[[int, int], int]) -> tuple[ForkedProcess, socket.s
 
     Returns
     -------
-    The process and our end of the channel; None where this process has other threads, which may hold locks
-    that the child would wait for.
+    The process and the parent's end of the channel; None if this process has other threads, which may hold
+    locks that the child would wait for.
 
     Raises
     ------
     OSError
-        No more processes or descriptors just now.
+        No more processes or descriptors are available at present.
     """
     if len(os.listdir("/proc/self/task")) > 1:
         return None
@@ -201,7 +201,7 @@ def fork_child(main: Callable[[int, int], int]) -> tuple[ForkedProcess, socket.s
 
 
 def _become(main: Callable[[int, int], int], fd: int, parent: int) -> NoReturn:
-    """Run as the child: of what the parent has open only standard error is left."""
+    """Run as the child; of the parent's descriptors only standard error and ``fd`` stay open."""
     code = 1
     try:
         os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -213,7 +213,7 @@ def _become(main: Callable[[int, int], int], fd: int, parent: int) -> NoReturn:
         os.setsid()
         os.chdir("/")
         code = main(fd, parent)
-    except BaseException:  # noqa: BLE001  nothing of the parent's may run in here any more
+    except BaseException:  # noqa: BLE001  no code of the parent may run in the child
         traceback.print_exc()
     finally:
         os._exit(code)
@@ -221,7 +221,7 @@ def _become(main: Callable[[int, int], int], fd: int, parent: int) -> NoReturn:
 
 @contextlib.contextmanager
 def _interrupts_blocked() -> Iterator[None]:
-    """Block SIGINT in this thread and in what it starts; one that came meanwhile is delivered afterwards."""
+    """Block SIGINT in this thread and its children; a SIGINT during the block is delivered afterwards."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

@@ -95,7 +95,7 @@ class Owned:
         self.__del__()
 
     def end(self) -> None:
-        """Give it back now although this object is still referred to; in a thread without signal handlers."""
+        """Release the resource although still referenced; only in a thread without signal handlers."""
         take_back, self.__del__ = self.__del__, bool  # which does nothing
         take_back()
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The shared-memory directory as the daemon uses it: make, publish, retire, list and remove segments.
 
-Nothing here maps a segment or keeps it open: what the kernel reports about users of a segment
-(`shmmap.segment.pins`) counts every open file, the daemon's own included.
+Nothing here maps a segment or keeps it open: the kernel's report of a segment's users (`shmmap.segment.pins`)
+counts every open file, including the daemon's own.
 """
 
 from __future__ import annotations

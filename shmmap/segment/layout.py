@@ -134,12 +134,11 @@ ColumnRow: TypeAlias = tuple[str, "np.dtype[np.generic]", tuple[int, ...], int, 
 class SegmentHeader(msgspec.Struct, frozen=True):
     """All fields of a segment's header; metres, map frame.
 
-    ``box`` is the cell's (min_x, min_y, max_x, max_y); ``z_min``/``z_max`` bound the points and are
-    NaN for an empty cell.  Coordinates in columns are relative to ``origin`` ((0, 0, 0) for
-    `points`, which keeps the source's bits).  ``rows`` counts the points kept,
-    ``source_points`` those in the file, ``dropped_points`` those left out as not finite,
-    ``outside_points`` those kept although they lie outside ``box``.
-    For a computed layer ``rows`` counts its own rows (points, voxels), which lie on ``lattice``.
+    ``box`` is the cell's (min_x, min_y, max_x, max_y); ``z_min``/``z_max`` bound the points and are NaN for
+    an empty cell.  Coordinates in columns are relative to ``origin`` ((0, 0, 0) for `points`, which keeps the
+    source's bits).  ``rows`` counts the kept points, ``source_points`` the points in the file,
+    ``dropped_points`` the non-finite points left out, ``outside_points`` the kept points outside ``box``. For
+    a computed layer ``rows`` counts its own rows (points, voxels), which lie on ``lattice``.
     """
 
     cell_id: str

@@ -70,7 +70,7 @@ def check_files(count: int, what: str) -> None:
     Raises
     ------
     LimitReached
-        It cannot; the message names ``what`` as what needs them.
+        The process cannot open that many; the message names ``what``, which needs them.
     """
     held: list[select.epoll] = []
     try:
@@ -116,7 +116,7 @@ def check_threads(count: int, what: str) -> None:
     Raises
     ------
     LimitReached
-        They cannot; the message names ``what`` as what needs them.
+        That many threads cannot be started; the message names ``what``, which needs them.
     """
     stay = _thread.allocate_lock()
     started: list[str] = []

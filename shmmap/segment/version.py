@@ -41,7 +41,8 @@ class Source(msgspec.Struct, frozen=True, array_like=True):
 
 
 Stamp: TypeAlias = bytes
-"""Identifies one state of a cell's source.  Only the origin that made it interprets it."""
+"""Identifies one state of a cell's source.  Only the origin that made it interprets it: for a file it is a
+`shmmap.segment.layout.SourceStamp`, otherwise a hash of the content, for example."""
 
 _LENGTH: Final = struct.Struct("<I")
 _BOX: Final = struct.Struct("<4d")

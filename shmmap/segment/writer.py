@@ -40,10 +40,8 @@ __all__ = [
 
 
 PIECE_BYTES: Final = 1 << 16
-"""Bytes per write, about 30 us: between writes other work may run on this processor.
-
-Otherwise a client just woken by its reply would wait until the loader on the same processor blocks.
-"""
+"""Bytes per write, about 30 us: between writes other work may run on this processor.  Otherwise a client just
+woken by its reply would wait until the loader on the same processor blocks."""
 
 
 def write_all(fd: int, data: memoryview, offset: int) -> None:
@@ -65,7 +63,7 @@ class SegmentWriter:
     rows
         Exact number of rows of every column.
     cell_id, layer, box, frame_id
-        What the segment describes.
+        The cell, layer, box and frame that the segment contains.
 
     Attributes
     ----------

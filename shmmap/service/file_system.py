@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The file system that a service is installed into: this machine's, or an image's below some directory.
+"""The file system into which a service is installed: this machine's, or that of an image in a directory.
 
-Paths are those that the installed system will have.  Symbolic links are followed as it will follow them: an
-absolute one starts at the image's root, and none leads out of it.
+Paths are those of the installed system, and symbolic links are followed as there: an absolute link starts at
+the image's root, and no link leads out of it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from shmmap.errors import BadRequest, CannotWrite
 
 __all__ = ["FileSystem"]
 
-_MAX_LINKS: Final = 40  # as Linux, in one path
+_MAX_LINKS: Final = 40  # links in one path, as in Linux
 
 
 class FileSystem:
@@ -30,7 +30,7 @@ class FileSystem:
     Raises
     ------
     BadRequest
-        It is no directory.
+        ``root`` is not a directory.
     """
 
     def __init__(self, root: str = "/") -> None:
@@ -43,11 +43,11 @@ class FileSystem:
 
     @property
     def is_this_machine(self) -> bool:
-        """Whether it is this machine's, and not an image's."""
+        """Whether this is the file system of this machine, and not of an image."""
         return self.root == "/"
 
     def inside(self, path: str) -> str:
-        """Return a path as the installed system will have it: one that lies below the root less the root."""
+        """Return a path as in the installed system: a path below the root loses the root."""
         found = os.path.abspath(path)
         for root in {self.root, os.path.abspath(self.root)} - {"/"}:
             for name in (found, os.path.realpath(found)):
@@ -56,12 +56,12 @@ class FileSystem:
         return found
 
     def resolve(self, path: str) -> str:
-        """Follow every symbolic link of a path inside, the last one, too; what is not there stays as it is.
+        """Resolve all symbolic links of a path inside, including the last; missing parts stay unchanged.
 
         Raises
         ------
         CannotWrite
-            Links lead in a circle.
+            The links form a loop.
         """
         links = 0
         done = "/"
@@ -86,21 +86,21 @@ class FileSystem:
         return done
 
     def outside(self, path: str) -> Path:
-        """Return where something inside lies for this process; links in its directory are followed.
+        """Return the path for this process of a path inside, with links in its directory resolved.
 
-        Its last name is not: a link there is the thing itself.
+        The path's last name is not resolved: if it is a link, the result is the link itself.
         """
         directory, name = os.path.split(path)
         return Path(os.path.normpath(f"{self.root}/{self.resolve(directory)}/{name}"))
 
     def status(self, path: str) -> os.stat_result | None:
-        """Return what something inside is, links followed; None where it is not there."""
+        """Return the status of a path inside, with links followed; None if it does not exist."""
         try:
             return os.lstat(self.root + self.resolve(path))
         except (OSError, CannotWrite):
             return None
 
     def is_executable(self, path: str) -> bool:
-        """Whether it is a file inside that can be run."""
+        """Return whether a path inside is an executable file."""
         status = self.status(path)
         return status is not None and stat.S_ISREG(status.st_mode) and bool(status.st_mode & 0o111)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Huge pages for the segments: which kernels gain by them, and the files that give them to the service.
+"""Huge pages for the segments: which kernels benefit, and the files that enable them for the service.
 
-A tmpfs with ``huge=within_size`` takes the largest pages that a file fills.  Up to Linux 6.13 these are of
-2 MiB; since then (large folios for tmpfs) of every power of two, so that cells of all sizes gain.
+A tmpfs with ``huge=within_size`` uses the largest pages that a file fills.  Up to Linux 6.13 these have 2
+MiB; since then (large folios for tmpfs) any power of two, so that cells of all sizes benefit.
 """
 
 from __future__ import annotations
@@ -22,33 +22,33 @@ _SWITCH: Final = "/sys/kernel/mm/transparent_hugepage/shmem_enabled"
 
 
 def kernel_version(release: str) -> str:
-    """Return "6.18" of ``uname -r``; empty where there is none in it."""
+    """Return the version, such as "6.18", from ``uname -r``; empty if there is none."""
     found = re.match(r"\d+\.\d+", release)
     return found[0] if found else ""
 
 
 def of_all_sizes(release: str) -> bool:
-    """Whether a kernel has large pages of all sizes for a tmpfs, by what ``uname -r`` says."""
+    """Return whether the kernel ``release`` (``uname -r``) has large pages of all sizes for a tmpfs."""
     version = kernel_version(release)
     return bool(version) and tuple(map(int, version.split("."))) >= _ALL_SIZES
 
 
 def check_possible(*, user: bool, switch: str = _SWITCH) -> None:
-    """Refuse what cannot work here.
+    """Raise an error if huge pages cannot work here.
 
     Parameters
     ----------
     user
-        The service is that of a user, and may mount nothing.
+        Whether the service is a user's, which cannot mount.
     switch
-        The kernel's own setting; there is none where it has no huge pages for a tmpfs.
+        File of the kernel's setting; missing if the kernel has no huge pages for a tmpfs.
 
     Raises
     ------
     BadRequest
-        For a user's service.
+        The service is a user's.
     ConfigError
-        The kernel has none.
+        The kernel has no huge pages for a tmpfs.
     """
     if user:
         raise BadRequest(

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What installing the service writes: planned first, so that it can be shown, then done.
+"""Install the service: plan the files first, so that the plan can be shown, then write them.
 
-Units are replaced (an operator's changes belong in drop-ins), a configuration that exists is kept.
+Units are replaced (an operator's changes belong in drop-ins); an existing configuration is kept.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ ROOT_OF_TRUST = "ROOT.json"
 """File name of the copy of a root of trust, in the directory of the configuration."""
 
 CREDENTIALS = ("shmmap.aws", "shmmap.google", "shmmap.azure")
-"""Files in /etc/shmmap that are passed to the service, whose account need not be able to read them."""
+"""Files in /etc/shmmap that systemd passes to the service, whose account need not be able to read them."""
 
 _GENERATED = "# Written by `shmmap unit install`, which replaces it.\n"
 
@@ -58,9 +58,9 @@ class PlannedFile:
     Attributes
     ----------
     path, text
-        Where it goes and what is in it.
+        Path and content of the file.
     keep
-        An existing one stays as it is.
+        Whether an existing file stays unchanged.
     """
 
     path: Path
@@ -69,7 +69,7 @@ class PlannedFile:
 
     @property
     def action(self) -> Literal["new", "changed", "same", "kept"]:
-        """What an installation does to this file: create it, change it, or leave it as it is."""
+        """Effect of the installation on this file: create it, change it, or leave it unchanged."""
         if not os.path.lexists(self.path):
             return "new"
         if self.keep:
@@ -77,7 +77,7 @@ class PlannedFile:
         return "same" if self._is_there() else "changed"
 
     def _is_there(self) -> bool:
-        """Whether just this file is there; a link, a pipe or a device is not."""
+        """Return whether a regular file exists at the path; a link, a pipe or a device does not count."""
         wanted = self.text.encode()
         fd = -1
         try:
@@ -104,7 +104,7 @@ def configuration(map_path: str = "", *, group: bool = True, trust: str = "") ->
 
 
 def _map_path(given: str, file_system: FileSystem) -> tuple[str, bool]:
-    """Return the map's path as the service will have it, and whether that is a URL to fetch it from."""
+    """Return the map's path as the service sees it, and whether it is a URL."""
     if is_url(given):
         url = read_url(given)
         if url.scheme != "file":
@@ -124,9 +124,9 @@ def _map_path(given: str, file_system: FileSystem) -> tuple[str, bool]:
 
 
 def _drop_in(path: Path, directories: Sequence[str], why: str) -> list[PlannedFile]:
-    """Plan a drop-in that shows directories to the daemon.
+    """Plan a drop-in that makes directories visible to the daemon.
 
-    One that is needed no more is emptied of settings, for nothing is deleted here.
+    A drop-in that is no longer needed is emptied, since an installation deletes no files.
     """
     if not directories and not path.exists():
         return []
@@ -135,7 +135,7 @@ def _drop_in(path: Path, directories: Sequence[str], why: str) -> list[PlannedFi
 
 
 def _network(path: Path, file_system: FileSystem, *, is_remote: bool) -> list[PlannedFile]:
-    """Plan a drop-in that lets the daemon fetch the map, with the credentials that there are."""
+    """Plan a drop-in that lets the daemon fetch the map, with the existing credentials."""
     if not is_remote and not path.exists():
         return []
     if not is_remote:
@@ -146,7 +146,7 @@ def _network(path: Path, file_system: FileSystem, *, is_remote: bool) -> list[Pl
 
 
 def _root_of_trust(given: str, path: Path) -> list[PlannedFile]:
-    """Plan a copy of a root of trust: the service may not see the original; it is not a secret."""
+    """Plan a copy of a root of trust, since the service may not see the original; it is not secret."""
     if not given:
         return []
     from shmmap.origin.remote.verify_apart import read_trusted_root
@@ -157,27 +157,27 @@ def _root_of_trust(given: str, path: Path) -> list[PlannedFile]:
 def plan_system(
     map_path: str = "", root: str = "/", *, huge_pages: bool = False, trust: str = ""
 ) -> list[PlannedFile]:
-    """Return what a service for the whole machine needs.
+    """Return the files for a service for the whole machine.
 
     Parameters
     ----------
     map_path
-        The map of the plain service, or its URL; empty: what the example says.  Of an image: as it will be
-        named there, or as it is here, below ``root``.
+        The map of the plain service, or its URL; empty: that of the example.  For an image: its path in the
+        image, or its present path below ``root``.
     root
-        Where the machine's file system begins: another directory than ``/`` for an image, which has the
-        program in it.
+        Root of the machine's file system; for an image, which must contain the program, another directory
+        than ``/``.
     huge_pages
-        Keep the segments on a tmpfs of their own, with huge pages; kept where an earlier installation did.
+        Keep the segments on a separate tmpfs with huge pages; also done if an earlier installation did.
     trust
-        Root of trust of a published map that is signed, a file of this machine; it is copied.
+        Root of trust of a signed published map: a file of this machine, which is copied.
 
     Raises
     ------
     MapMissing
         There is nothing at ``map_path``.
     BadRequest
-        ``root`` is no directory, or a URL cannot be served.
+        ``root`` is not a directory, or a URL cannot be served.
     ConfigError
         The image has no program, or the service's account could not read it; or ``trust`` is not a root of
         trust.
@@ -221,7 +221,7 @@ def plan_system(
 
 
 def plan_user(map_path: str = "", config_home: str = "", *, trust: str = "") -> list[PlannedFile]:
-    """Return what a user's own service needs; parameters and errors as for `plan_system`."""
+    """Return the files for a user's own service; parameters and errors as for `plan_system`."""
     map_path, _ = _map_path(map_path, FileSystem())
     home = Path(config_home or os.environ.get("XDG_CONFIG_HOME", "") or Path.home() / ".config")
     return [
@@ -240,7 +240,7 @@ def plan_user(map_path: str = "", config_home: str = "", *, trust: str = "") -> 
 
 
 def write(planned: Sequence[PlannedFile]) -> None:
-    """Write the files that are new or changed, each in one step.
+    """Write the new and changed files, each atomically.
 
     Raises
     ------
@@ -295,7 +295,7 @@ def shipped_text(name: str) -> str:
     Raises
     ------
     BadRequest
-        There is no file of this name; the hint lists those there are.
+        There is no file of this name; the hint lists the existing ones.
     """
     if name not in shipped_names():
         raise BadRequest(f"there is no file {name!r}", hint="there are: " + ", ".join(shipped_names()))

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a unit starts the daemon: by this installation, or by the one that an image has.
+"""How a unit starts the daemon: from this installation, or from that of an image.
 
-The units hide home directories and /tmp from the daemon.  An installation that lies there (a virtual
-environment in a home, a Python of pyenv or uv) is made visible again, read-only and nothing else with
-it.  What only its owner may read stays closed to the service: that is refused, with the commands that install
-the program where every account can read it.
+The units hide home directories and /tmp from the daemon.  An installation there (a virtual environment in a
+home, a Python of pyenv or uv) is made visible again, read-only and without other files.  Files that only
+their owner may read stay inaccessible to the service: such an installation is refused, with the commands to
+install the program where every account can read it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ __all__ = [
 ]
 
 INSTALL_FOR_SERVICE: Final = "python3 -m venv /opt/shmmap && /opt/shmmap/bin/pip install ."
-"""As root, in a checkout: the program where the units of a machine can start it."""
+"""Commands for root, in a checkout, to install the program where a machine's units can start it."""
 INSTALL_IN_IMAGE: Final = (
     "cp -r . IMAGE/usr/src/shmmap && chroot IMAGE sh -c"
     " 'python3 -m venv /opt/shmmap && /opt/shmmap/bin/pip install /usr/src/shmmap'"
@@ -49,11 +49,11 @@ class Program:
     Attributes
     ----------
     daemon, bridge
-        What starts the daemon, and the bridge to ROS.
+        Commands that start the daemon, and the bridge to ROS.
     places
-        Directories that the service has to see.
+        Directories that must be visible to the service.
     read
-        Directories and files that the service's account has to be able to read.
+        Directories and files that the service's account must be able to read.
     """
 
     daemon: tuple[str, ...]
@@ -64,7 +64,7 @@ class Program:
 
     @classmethod
     def this_one(cls) -> Program:
-        """Return the installation that runs."""
+        """Return the running installation."""
 
         def command(name: str, module: str) -> tuple[str, ...]:
             script = os.path.join(sys.prefix, "bin", name)
@@ -82,12 +82,12 @@ class Program:
 
     @classmethod
     def in_image(cls, file_system: FileSystem) -> Program:
-        """Return the installation that an image has: this one, if it lies there, else that in /opt/shmmap.
+        """Return an image's installation: this one, if it lies in the image, else that in /opt/shmmap.
 
         Raises
         ------
         ConfigError
-            It has none, or one that would not start there.
+            The image has no installation, or one that would not start there.
         """
         own = file_system.inside(os.path.join(sys.prefix, "bin"))
         for folder in dict.fromkeys((own, *_IN_IMAGES)):
@@ -112,16 +112,16 @@ class Program:
 
     @property
     def hidden_directories(self) -> list[str]:
-        """Directories that the program needs and that the units would hide from it."""
+        """Directories that the program needs, but that the units would hide."""
         return outermost(place for place in self.places if is_hidden(place))
 
     def check_readable(self) -> None:
-        """Refuse what an account without rights of its own, the service's, cannot read.
+        """Raise an error if the service's account, without special rights, cannot read the program.
 
         Raises
         ------
         ConfigError
-            It names what is closed, and how to install the program for the service.
+            A path is not readable; the message names it, and how to install the program for the service.
         """
         for path in self.read:
             if (closed := self._closed_to_others(path)) is not None:
@@ -132,9 +132,9 @@ class Program:
                 )
 
     def _closed_to_others(self, path: str) -> str | None:
-        """First directory on the way to ``path``, or itself, that others may not enter or read; else None.
+        """Return the first part of ``path`` that other users may not enter or read; None if there is none.
 
-        What lies above a directory that the units show does not matter: it is shown whatever that allows.
+        Directories above one that the units make visible do not matter: their permissions are bypassed.
         """
         shown = self.hidden_directories
         start = next((place for place in shown if path == place or path.startswith(place + "/")), "/")
@@ -153,12 +153,12 @@ class Program:
 
 
 def _interpreter(file_system: FileSystem, script: str) -> str:
-    """Return the interpreter of a script in an image, which has to be there.
+    """Return the interpreter of a script in an image, which must exist there.
 
     Raises
     ------
     ConfigError
-        It is not: the script was made outside of the image, or Python is missing there.
+        The interpreter is missing: the script was created outside the image, or the image has no Python.
     """
     with open(file_system.root + file_system.resolve(script), "rb") as file:
         first = file.readline(4096)
@@ -175,18 +175,18 @@ def _interpreter(file_system: FileSystem, script: str) -> str:
 
 
 def quoted(word: str) -> str:
-    """Return a word as units write it (systemd.syntax(7)): nothing in it is expanded or split."""
+    """Return a word quoted for units (systemd.syntax(7)), so that it is neither expanded nor split."""
     escaped = word.replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%")
     return f'"{escaped}"' if re.search(r"[\s\"']", word) else escaped
 
 
 def is_hidden(path: str) -> bool:
-    """Whether the units hide ``path`` from the daemon."""
+    """Return whether the units hide ``path`` from the daemon."""
     return any(path == place or path.startswith(place + "/") for place in _HIDDEN)
 
 
 def outermost(paths: Iterable[str]) -> list[str]:
-    """Return the paths that lie in no other of them, sorted."""
+    """Return the paths that lie in none of the others, sorted."""
     kept: list[str] = []
     for path in sorted(set(paths)):
         if not any(path.startswith(other.rstrip("/") + "/") for other in kept):
@@ -195,5 +195,5 @@ def outermost(paths: Iterable[str]) -> list[str]:
 
 
 def command_line(words: Sequence[str]) -> str:
-    """Return words as ``ExecStart=`` has them."""
+    """Return words as a command line for ``ExecStart=``."""
     return " ".join(quoted(word) for word in words)

@@ -29,9 +29,9 @@ __all__ = [
 class Counter(NamedTuple):
     """One number the daemon keeps.
 
-    ``kind`` is ``counter`` for what only grows during one run of the daemon and ``gauge`` for a
-    present amount; a ``histogram`` counts durations (`Histogram`).  ``unit`` is
-    empty for plain counts.
+    ``kind`` is ``counter`` for a number that only grows during one run of the daemon, ``gauge`` for a present
+    amount, and ``histogram`` for a distribution of durations (`Histogram`).  ``unit`` is empty for plain
+    counts.
     """
 
     name: str
@@ -41,7 +41,7 @@ class Counter(NamedTuple):
 
 
 SPANS: Final = {"10s": 10, "1min": 60, "10min": 600}
-"""Spans over which some counters are also summed, by suffix, in seconds."""
+"""Time spans over which some counters are also summed, seconds, by suffix."""
 
 WINDOWED: Final = {
     "hits": "Cells answered from memory",
@@ -51,7 +51,7 @@ WINDOWED: Final = {
     "refused_over_budget": "Cells refused because the budget is full",
     "prefetch_misses": "Cells that a moving client requested and had to wait for",
 }
-"""Counters of which the last 10 s, 1 min and 10 min are shown: what the present state is judged by."""
+"""Counters that are also shown for the last 10 s, 1 min and 10 min, to judge the present state."""
 
 TURN_KINDS: Final = {
     "clients": "clients were read",
@@ -63,10 +63,10 @@ TURN_KINDS: Final = {
     "statistics": "the statistics were written",
     "map": "another state of the map was taken over",
 }
-"""What a turn of the serving loop is named after: what took most of it."""
+"""Kinds of turns of the serving loop, by the work that took most of the turn."""
 
 REFUSALS: Final = ("", "unsigned", "older", "expired", "altered", "foreign_root", "other")
-"""Why the offered version of a published map is not taken, by the value of ``published_refusal``."""
+"""Reasons for refusing the offered version of a published map, by the value of ``published_refusal``."""
 
 OBJECTS_READ: Final = {
     "objects_from_disk": ("", "Objects read from the disk cache instead of the store"),
@@ -77,7 +77,7 @@ OBJECTS_READ: Final = {
     "objects_damaged_in_store": ("", "Objects from the store that did not match their name's hash"),
     "fetches_failed": ("", "Times that an object could not be fetched from the store"),
 }
-"""Counters of what a daemon of a published map and its loaders read: unit and help."""
+"""Counters of objects that the daemon of a published map and its loaders read: unit and help."""
 
 _PUBLISHED: Final = (
     *(Counter(name, "counter", unit, text) for name, (unit, text) in OBJECTS_READ.items()),
@@ -98,7 +98,7 @@ _PUBLISHED: Final = (
 )
 
 PUBLISHED: Final = frozenset(counter.name for counter in _PUBLISHED)
-"""Counters that mean nothing if the map is files."""
+"""Counters that apply only to published maps, not to maps from files."""
 
 COUNTERS: Final = (
     Counter("requests", "counter", "", "Requests received, well-formed or not"),
@@ -227,12 +227,12 @@ def bucket_of(duration_ns: int) -> int:
         return 0
     if exponent >= LAST_EXPONENT:
         return BUCKETS - 1
-    # the two bits below the leading one are the quarter of the octave
+    # the two bits below the leading bit select the quarter of the octave
     return 4 * (exponent - FIRST_EXPONENT) + (duration_ns >> (exponent - 2)) - 3
 
 
 def lower_bound_ns(bucket: int) -> int:
-    """Return the shortest duration a bucket counts; it is where the bucket before it ends."""
+    """Return the shortest duration that a bucket counts, which is the end of the previous bucket."""
     if bucket <= 0:
         return 0
     octave, step = divmod(bucket - 1, STEPS)
@@ -240,19 +240,19 @@ def lower_bound_ns(bucket: int) -> int:
 
 
 class Histogram(NamedTuple):
-    """Durations counted since the daemon started, in buckets that any reader can compute.
+    """Distribution of durations since the daemon's start, in buckets that any reader can compute.
 
-    There are four to an octave, from 1 us to 73 min.  Bucket 0 counts what is below 2^10 ns.  Bucket
-    ``1 + 4 (e - 10) + s`` counts what lies in ``[2^e (1 + s/4), 2^e (1 + (s + 1)/4))`` ns, for e in 10 … 41
-    and s in 0 … 3.  The last bucket counts what is 2^42 ns and longer.  A bucket is at most a quarter wider
-    than its lower bound, and finding it takes no logarithm.
+    An octave has four buckets, from 1 us to 73 min.  Bucket 0 counts durations below 2^10 ns.  Bucket ``1 + 4
+    (e - 10) + s`` counts durations in ``[2^e (1 + s/4), 2^e (1 + (s + 1)/4))`` ns, for e in 10 … 41 and s in
+    0 … 3.  The last bucket counts durations of 2^42 ns and longer.  A bucket is at most a quarter wider than
+    its lower bound, and finding it takes no logarithm.
 
     Attributes
     ----------
     sum_ns
-        All of them together.
+        Sum of all durations, ns.
     counts
-        How many fell in each bucket.
+        Number of durations in each bucket.
     """
 
     sum_ns: int = 0
@@ -260,14 +260,14 @@ class Histogram(NamedTuple):
 
     @property
     def total(self) -> int:
-        """How many there are."""
+        """Number of durations."""
         return sum(self.counts)
 
     def quantile_s(self, share: float) -> float | None:
-        """Return the duration in seconds that ``share`` of all do not exceed; None when there is none.
+        """Return the duration in seconds that a ``share`` of all does not exceed; None if there are none.
 
-        Within a bucket they are taken to be spread evenly, so that it is right to an eighth or so; of the
-        last bucket only the lower bound is known.
+        Durations are assumed to be spread evenly within a bucket, so the result is accurate to about an
+        eighth.  For the last bucket only the lower bound is known.
         """
         total = self.total
         if not total:
@@ -283,11 +283,11 @@ class Histogram(NamedTuple):
         return lower_bound_ns(len(self.counts) - 1) * 1e-9
 
     def since(self, earlier: Histogram) -> Histogram:
-        """Return what was counted after ``earlier``, a state of the same histogram."""
+        """Return the durations counted after ``earlier``, a previous state of the same histogram."""
         counts = tuple(new - old for new, old in zip(self.counts, earlier.counts, strict=True))
         return Histogram(self.sum_ns - earlier.sum_ns, counts)
 
     @classmethod
     def of(cls, values: Sequence[int]) -> Histogram:
-        """Make one of the sum and the counts as they lie in a segment."""
+        """Make a histogram from its sum and counts in a segment."""
         return cls(values[0], tuple(values[1:]))

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One daemon for an instance's names, whatever its runtime directory: the writer of the statistics has them.
+"""Ensure one daemon per instance name, whatever its runtime directory, by a lock on the statistics segment.
 
-The writer holds an open-file-description lock on its segment while it lives.  It is a write lock, which
-a process that may only read the file cannot get: a client can neither hold the name nor keep a daemon from
-it.  A second daemon asks for write locks alone, on files that its own user or root made.
+The writer of the statistics holds an open-file-description lock on its segment as long as it runs.  It is a
+write lock, which a process with read access cannot get: so a client can neither hold the name nor block a
+daemon.  A second daemon checks only write locks, on files of its own user or root.
 """
 
 from __future__ import annotations
@@ -29,40 +29,40 @@ _ATTEMPTS: Final = 16
 
 
 def hold(fd: int) -> None:
-    """Mark a segment that has no name yet as the one of this process, until its descriptor is closed."""
+    """Lock a segment without a name for this process, until its descriptor is closed."""
     fcntl.fcntl(fd, _OFD_SETLK, _FLOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, 0, 1, 0))
 
 
 def has_writer(directory: ShmDirectory, name: str) -> bool:
-    """Whether a process writes the statistics ``name``; another user's file does not count."""
+    """Return whether a process writes the statistics ``name``; another user's file does not count."""
     try:
         with directory.opened(name) as fd:
             status = os.fstat(fd)
             if not stat.S_ISREG(status.st_mode) or status.st_uid not in (os.geteuid(), 0):
                 return False
-            asked = _FLOCK.pack(fcntl.F_RDLCK, os.SEEK_SET, 0, 1, 0)  # which a read lock does not hinder
+            asked = _FLOCK.pack(fcntl.F_RDLCK, os.SEEK_SET, 0, 1, 0)  # a read lock does not conflict with it
             return bool(_FLOCK.unpack(fcntl.fcntl(fd, _OFD_GETLK, asked))[0] == fcntl.F_WRLCK)
     except OSError:
         return False
 
 
 def refuse_second(directory: ShmDirectory, instance: str) -> None:
-    """Raise `InstanceBusy` if a daemon has the names of ``instance`` in this directory."""
+    """Raise `InstanceBusy` if a daemon uses the names of ``instance`` in this directory."""
     if has_writer(directory, statistics_name(instance)):
         raise _busy(directory, instance)
 
 
 def take_name(directory: ShmDirectory, instance: str, fd: int) -> None:
-    """Give the finished segment its name, in place of one that a dead daemon left.
+    """Give the finished segment its name, replacing a segment that a dead daemon left.
 
-    Of several that try at the same time one gets it.
+    If several daemons try at the same time, one succeeds.
 
     Raises
     ------
     InstanceBusy
-        Another daemon has it.
+        Another daemon has the name.
     CannotStart
-        Something is there that cannot be removed.
+        An existing file cannot be removed.
     OSError
         The directory is full.
     """
@@ -82,12 +82,12 @@ def take_name(directory: ShmDirectory, instance: str, fd: int) -> None:
         try:
             if stat.S_ISDIR(os.lstat(directory.path + name).st_mode):
                 raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-            directory.rename(name, aside)  # what is unlinked by its name may be a newer one
+            directory.rename(name, aside)  # an unlink by name might remove a newer segment
         except FileNotFoundError:
             continue
         except OSError as error:
             raise _taken(directory, name, error) from error
-        if has_writer(directory, aside):  # it came since we asked: the name is its
+        if has_writer(directory, aside):  # another daemon took the name since the check
             os.rename(directory.path + aside, directory.path + name)
             raise _busy(directory, instance)
         directory.unlink(aside)

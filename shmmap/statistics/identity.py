@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which daemon writes the statistics, and whether that very process still lives.
+"""Identify the daemon that writes the statistics, and check whether that process still runs.
 
-A process id alone may belong to another process by now; with the process's start time it cannot.
+A process id may be reused; together with the process's start time it is unique.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ __all__ = ["DaemonIdentity", "DaemonState", "WriterProcess", "judge", "pid_names
 DaemonState: TypeAlias = Literal["healthy", "starting", "stopped", "hung", "dead"]
 
 HUNG_AFTER_S: Final = 5.0
-"""A running daemon without a beat for this long is called hung."""
+"""Time without a beat after which a running daemon counts as hung."""
 
 
 def _stat_fields(pid: int) -> list[str]:
     with open(f"/proc/{pid}/stat", "rb") as file:
         text = file.read().decode("utf-8", "replace")
-    return text[text.rindex(")") + 2 :].split()  # the command before it may hold spaces and brackets
+    return text[text.rindex(")") + 2 :].split()  # the command in front may contain spaces and brackets
 
 
 def start_time_ticks(pid: int) -> int:
@@ -32,7 +32,7 @@ def start_time_ticks(pid: int) -> int:
 
 
 def pid_namespace() -> int:
-    """Return the inode of this process's pid namespace; 0 where /proc does not say."""
+    """Return the inode of this process's pid namespace; 0 if /proc does not show it."""
     try:
         return os.stat("/proc/self/ns/pid").st_ino
     except OSError:
@@ -41,7 +41,7 @@ def pid_namespace() -> int:
 
 @dataclass(frozen=True, slots=True)
 class DaemonIdentity:
-    """One run of the daemon and what it serves.
+    """A run of the daemon, and the map that it serves.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class DaemonIdentity:
     map_path, map_version, frame_id
         The map as configured, 64-bit hash of its catalogue, frame of its coordinates.
     id_prefix
-        What the ids of the cell table lack in front.
+        Prefix that the ids in the cell table lack.
     library_version
         Version of shmmap the daemon runs.
     started_unix_ns
@@ -84,12 +84,12 @@ class DaemonIdentity:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> DaemonIdentity:
-        """Return the identity; names this version does not know are left out.
+        """Return the identity; names that this version does not know are ignored.
 
         Raises
         ------
         SegmentCorrupt
-            If a name is missing or a number is none.
+            A name is missing or a number is invalid.
         """
         parts = data.split(b"\0")
         found = {
@@ -117,9 +117,9 @@ class DaemonIdentity:
 
 
 def _process_state(pid: int, start_ticks: int) -> Literal["running", "stopped", "dead", "unknown"]:
-    """Return what the kernel says of the process that had this id and start time.
+    """Return the kernel's state of the process with this id and start time.
 
-    ``unknown`` where /proc hides other users' processes.
+    ``unknown`` if /proc hides other users' processes.
     """
     try:
         found = _stat_fields(pid)
@@ -141,8 +141,8 @@ def _process_state(pid: int, start_ticks: int) -> Literal["running", "stopped", 
 class WriterProcess:
     """The process that writes the statistics, watched through one descriptor of ``/proc/PID/stat``.
 
-    The descriptor still means that very process when its id is used again, and reading it takes a
-    third of the time that opening it does.
+    The descriptor refers to that process even when its id is reused, and reading takes a third of the time of
+    opening.
     """
 
     def __init__(self, identity: DaemonIdentity) -> None:
@@ -150,7 +150,7 @@ class WriterProcess:
         self._fd = -1
         self._elsewhere = identity.pid_namespace not in (0, pid_namespace())
         if self._elsewhere:
-            return  # its pid means another process here: only the beat counts
+            return  # the pid is not valid in this namespace: only the beat counts
         try:
             fd = os.open(f"/proc/{identity.pid}/stat", os.O_RDONLY | os.O_CLOEXEC)
         except OSError:
@@ -165,7 +165,7 @@ class WriterProcess:
             os.close(fd)
 
     def state(self, beat_age_s: float) -> DaemonState:
-        """Return how the daemon is, given the age of its last beat in seconds."""
+        """Return the daemon's state, given the age of its last beat in seconds."""
         if self._fd < 0:
             return judge(self._identity, beat_age_s)
         found = _read_stat(self._fd)
@@ -179,7 +179,7 @@ class WriterProcess:
         return "healthy" if beat_age_s <= HUNG_AFTER_S else "hung"
 
     def close(self) -> None:
-        """Give the descriptor back."""
+        """Close the descriptor."""
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
@@ -193,9 +193,9 @@ def _read_stat(fd: int) -> bytes | None:
 
 
 def judge(identity: DaemonIdentity, beat_age_s: float) -> DaemonState:
-    """Return how the daemon is, from its process and the age of its last beat in seconds."""
+    """Return the daemon's state, from its process and the age of its last beat in seconds."""
     if identity.pid_namespace and identity.pid_namespace != pid_namespace():
-        process: str = "unknown"  # its pid means another process here: only the beat counts
+        process: str = "unknown"  # the pid is not valid in this namespace: only the beat counts
     else:
         process = _process_state(identity.pid, identity.start_time_ticks)
     if process == "dead":

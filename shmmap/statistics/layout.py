@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The bytes of the statistics segment; ``STATISTICS.md`` is the byte-exact document.
+"""The bytes of the statistics segment; ``STATISTICS.md`` is the byte-exact specification.
 
 Only the standard library is imported here: a program that shows the statistics starts fast.
 """
@@ -62,7 +62,7 @@ KINDS: Final[tuple[Literal["counter", "gauge", "histogram"], ...]] = ("counter",
 
 
 class Header(NamedTuple):
-    """Where things lie, and what the counters mean."""
+    """Positions in the segment, and descriptions of the counters."""
 
     counters: tuple[Counter, ...]
     identity_offset: int
@@ -85,12 +85,12 @@ class Header(NamedTuple):
 
     @property
     def descriptions_end(self) -> int:
-        """Where the part that never changes ends, in a segment of this version."""
+        """End of the constant part, in a segment of this version."""
         return DESCRIPTIONS_OFFSET + (len(self.counters) + len(self.histograms)) * DESCRIPTION.size
 
 
 class State(NamedTuple):
-    """What one beat wrote; ``histograms`` holds sum and counts of each, one after the other."""
+    """Data of one beat; ``histograms`` has the sum and counts of each, one after the other."""
 
     sequence: int
     beat_monotonic_ns: int
@@ -147,7 +147,7 @@ def _pack_descriptions(counters: Sequence[Counter]) -> bytes:
 
 
 def pack_header(header: Header) -> bytes:
-    """Return the bytes that never change: offsets, and descriptions of counters and histograms."""
+    """Return the constant bytes: offsets, and descriptions of counters and histograms."""
     counters, histograms = _pack_descriptions(header.counters), _pack_descriptions(header.histograms)
     start = START.pack(
         MAGIC, *LAYOUT_VERSION, BYTE_ORDER, DESCRIPTIONS_OFFSET, len(header.counters), DESCRIPTION.size,
@@ -172,7 +172,7 @@ def unpack_header(data: bytes) -> Header:
     Raises
     ------
     SegmentCorrupt
-        If it is none, has another major layout version, or contradicts itself.
+        It is not a statistics segment, has another major layout version, or is inconsistent.
     """
     if len(data) < START.size:
         raise SegmentCorrupt(f"a statistics segment of {len(data)} bytes is shorter than its header")

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The statistics in Prometheus' text format, version 0.0.4.
 
-https://prometheus.io/docs/instrumenting/exposition_formats/ says what a line may look like.
+Format of a line: https://prometheus.io/docs/instrumenting/exposition_formats/
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ _LIVE = {
 }
 
 _NO_TIME_IF_0 = {"origin_out_since_unix_ns", "published_expires_unix_ns", "published_signed_unix_ns"}
-"""Times that are 0 are left out: 1970 would raise alarms."""
+"""Times that are left out if they are 0: the year 1970 would raise alarms."""
 
 _SHOWN_ELSEWHERE = {f"{name}_{span}" for name in WINDOWED for span in SPANS}  # Prometheus has rate()
 
 
 def exposition(found: Snapshot, instance: str) -> str:
-    """Return the text of a scrape; of a daemon that is not there it says only that it is not up.
+    """Return the text of a scrape; without a daemon it contains only that the daemon is not up.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def _lines(found: Snapshot, instance: str) -> Iterator[str]:
 
 
 def _live_maps(rows: Sequence[LiveMapRow], label: str) -> Iterator[str]:
-    """Each family once, with a sample for each map."""
+    """Yield each metric family once, with a sample for each map."""
     labels = [f'{label},map="{_escaped(row.name)}"' for row in rows]
     for field, (name, kind, text) in _LIVE.items() if rows else ():
         yield f"# HELP shmmap_live_{name} {_escaped_help(text)}"
@@ -114,7 +114,7 @@ def _live_maps(rows: Sequence[LiveMapRow], label: str) -> Iterator[str]:
 
 
 def _histogram(name: str, label: str, histogram: Histogram) -> Iterator[str]:
-    """One bucket per octave: a quarter of what the segment has is enough for a chart."""
+    """Yield a histogram with one bucket per octave, a quarter of the segment's: enough for a chart."""
     below = 0
     counts = histogram.counts
     for bucket, count in enumerate(counts[:-1]):

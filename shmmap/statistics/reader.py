@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading the statistics segment: works while the daemon is busy, stopped, hung or dead.
+"""Read the statistics segment, also while the daemon is busy, stopped, hung or dead.
 
-Nothing is mapped and nothing is locked, so a reader can neither delay nor hurt the daemon.
+Nothing is mapped or locked, so a reader can neither delay nor harm the daemon.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ _HEADER_BYTES = 16384
 
 
 class StatisticsReader:
-    """Keeps an instance's statistics open, to be read repeatedly.
+    """Keeps an instance's statistics open, for repeated reads.
 
     Parameters
     ----------
     instance, shm_dir
-        Which daemon, and the directory of its segments.  It need not run yet: the segment is opened
-        when it is there, and again when another daemon has replaced it.
+        Name of the daemon's instance, and directory of its segments.  The daemon need not run yet: the
+        segment is opened when it exists, and again when another daemon has replaced it.
     """
 
     def __init__(self, instance: str = "default", shm_dir: str = DEFAULT_SHM_DIR) -> None:
@@ -59,7 +59,7 @@ class StatisticsReader:
         self.close()
 
     def close(self) -> None:
-        """Give the descriptors back."""
+        """Close the descriptors."""
         if self._process is not None:
             self._process.close()
             self._process = None
@@ -75,16 +75,16 @@ class StatisticsReader:
         Parameters
         ----------
         tables
-            Copy the rows of cells and clients too; without, a snapshot takes some microseconds.
+            Copy the rows of cells and clients, too; without them a snapshot takes some microseconds.
         cells
-            Copy those of cells: 256 bytes each.
+            Copy the rows of cells, 256 bytes each.
 
         Raises
         ------
         NotPermitted
             This user may not read the segment.
         SegmentCorrupt
-            It is damaged or of another major layout version.
+            The segment is damaged or of another major layout version.
         """
         status = os.fstat(self._fd) if self._fd >= 0 else None
         if status is not None and not status.st_nlink:  # its daemon ended, or another one has replaced it
@@ -92,7 +92,7 @@ class StatisticsReader:
             status = None
         if status is None:
             try:
-                # a pipe of that name would keep the opener waiting
+                # a pipe of that name would block the opener
                 self._fd = os.open(self._path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
             except FileNotFoundError:
                 return Snapshot("absent", None)
@@ -142,21 +142,21 @@ def read_statistics(instance: str = "default", shm_dir: str = DEFAULT_SHM_DIR) -
     Parameters
     ----------
     instance, shm_dir
-        Which daemon, and the directory of its segments.
+        Name of the daemon's instance, and directory of its segments.
 
     Raises
     ------
     NotPermitted
         This user may not read the segment.
     SegmentCorrupt
-        It is damaged or of another major layout version.
+        The segment is damaged or of another major layout version.
     """
     with StatisticsReader(instance, shm_dir) as reader:
         return reader.snapshot()
 
 
 _last_header: tuple[bytes, Header] | None = None
-"""Bytes and meaning of the last header: it is the same for all daemons of one version."""
+"""Bytes and content of the last header, which is the same for all daemons of one version."""
 
 
 def _read_header(fd: int, size: int) -> Header:
@@ -200,7 +200,7 @@ def _newest_state(fd: int, header: Header) -> State:
     for _ in range(_ATTEMPTS):
         both = os.pread(fd, 2 * size, header.state_offset)
         halves = both[:size], both[size:]
-        # the newer one is whole unless the writer is at it: look at the other one only then
+        # the newer block is complete unless the writer is changing it: read the other one only then
         if halves[0][:8][::-1] < halves[1][:8][::-1]:
             halves = halves[::-1]
         for half in halves:
@@ -211,7 +211,7 @@ def _newest_state(fd: int, header: Header) -> State:
 
 
 def _rows(fd: int, header: Header, used: int) -> bytes:
-    """Copy the table as of one moment if the writer allows, else row by row (each has a checksum)."""
+    """Copy the table consistently if the writer pauses, else row by row (each row has a checksum)."""
     nbytes = _within(fd, header.rows_offset, min(used, header.max_rows) * header.row_bytes)
     rows = b""
     for _ in range(_TABLE_ATTEMPTS):
@@ -233,5 +233,5 @@ def _live(fd: int, header: Header) -> bytes:
 
 
 def _within(fd: int, offset: int, nbytes: int) -> int:
-    """How many of these bytes there are: pread makes room for all that it is asked for."""
+    """Return how many of these bytes exist, since pread allocates the whole requested length."""
     return max(0, min(nbytes, os.fstat(fd).st_size - offset))

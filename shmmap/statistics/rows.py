@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rows of the statistics segment: length, checksum and MessagePack, in a place of fixed size."""
+"""Rows of the statistics segment: length, checksum and MessagePack, in slots of fixed size."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _SHORTENED: Final[dict[type[msgspec.Struct], dict[str, int]]] = {
     ClientRow: {"client": 0, "command": 0},
     LiveMapRow: {"mappers": 0, "damaged": 0, "path": 200, "problem": 0},
 }
-"""Fields of a row too long for its place, in the order they are shortened, and the bytes they keep."""
+"""Fields that are shortened in a row that is too long, in order, and the bytes that they keep."""
 _KEEP_END: Final = {"id", "path"}
 _MARK: Final = "…"
 
@@ -34,10 +34,10 @@ _encode: Final = msgspec.msgpack.Encoder().encode
 
 
 def pack_row(row: msgspec.Struct, size: int) -> bytes:
-    """Return the bytes of a row, at most ``size``; texts that are cut have an ellipsis there."""
+    """Return the bytes of a row, at most ``size``; shortened texts contain an ellipsis."""
     try:
         data = _encode(row)
-    except UnicodeEncodeError:  # names of files need not be text
+    except UnicodeEncodeError:  # file names need not be valid text
         row = msgspec.structs.replace(row, **{n: _text(v) for n, v in _texts(row).items()})
         data = _encode(row)
     for name, kept_bytes in _SHORTENED[type(row)].items() if len(data) > size - HEAD.size else ():
@@ -77,12 +77,12 @@ def _decoder(kind: type[_Row]) -> msgspec.msgpack.Decoder[_Row]:
 
 
 def unpack_row(kind: type[_Row], data: memoryview) -> _Row | None:
-    """Return a row of the table's ``kind``; None of a free place.
+    """Return a row of the table's ``kind``; None for a free slot.
 
     Raises
     ------
     SegmentCorrupt
-        The row is torn (the writer was changing it), or none of that kind.
+        The row is torn (the writer was changing it), or not of that kind.
     """
     length, crc = HEAD.unpack_from(data)
     if not length:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the statistics segment said at one moment."""
+"""Content of the statistics segment at one moment."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Snapshot:
     Attributes
     ----------
     state : str
-        ``healthy``; ``starting`` (it beats, and does not listen yet); ``stopped`` (SIGSTOP, a debugger);
+        ``healthy``; ``starting`` (it beats, but does not listen yet); ``stopped`` (SIGSTOP, a debugger);
         ``hung`` (runs, but has not beaten for 5 s); ``dead`` (the process is gone and left its segment);
         ``absent`` (no segment: never started, or stopped cleanly).  All but ``absent`` come with an identity.
     identity : DaemonIdentity or None
@@ -35,9 +35,9 @@ class Snapshot:
     beat_age_s : float
         Seconds since the daemon last wrote; infinite when absent.
     beat_monotonic_ns : int
-        When that was, CLOCK_MONOTONIC.
+        Time of that write, CLOCK_MONOTONIC.
     rows_missing : int
-        Cells the table had no room for.
+        Number of cells for which the table had no room.
     size_bytes : int
         Memory of the segment.
     """
@@ -71,7 +71,7 @@ class Snapshot:
 
     @cached_property
     def counters(self) -> dict[str, int]:
-        """Values by name."""
+        """Values of the counters by name."""
         if self._header is None or self._values is None:
             return {}
         names = (counter.name for counter in self._header.counters)
@@ -79,17 +79,17 @@ class Snapshot:
 
     @property
     def descriptions(self) -> tuple[Counter, ...]:
-        """What the counters mean, in the daemon's order."""
+        """Descriptions of the counters, in the daemon's order."""
         return self._header.counters if self._header is not None else ()
 
     @property
     def histogram_descriptions(self) -> tuple[Counter, ...]:
-        """What the histograms mean, in the daemon's order."""
+        """Descriptions of the histograms, in the daemon's order."""
         return self._header.histograms if self._header is not None else ()
 
     @cached_property
     def histograms(self) -> dict[str, Histogram]:
-        """Durations by name."""
+        """Histograms by name."""
         if self._header is None or self._values is None:
             return {}
         step = 1 + self._header.bucket_count
@@ -104,7 +104,7 @@ class Snapshot:
     def cells(self) -> list[CellRow]:
         """The segments the daemon keeps, in id order, then layer and version.
 
-        A row the daemon was changing at that very moment (it was stopped in mid-write) is left out.
+        A row that the daemon was changing at that moment (it was stopped during a write) is left out.
         """
         from shmmap.protocol.rows import CellRow
 
@@ -113,7 +113,7 @@ class Snapshot:
 
     @cached_property
     def clients(self) -> list[ClientRow]:
-        """The clients there is room for in the table, in the order they came."""
+        """The clients in the table, which may lack room for all, in order of arrival."""
         from shmmap.protocol.rows import ClientRow
 
         step = self._header.client_row_bytes if self._header is not None else 0
@@ -123,7 +123,7 @@ class Snapshot:
     def live(self) -> list[LiveMapRow]:
         """The live maps that the daemon keeps."""
         if not self._live.strip(b"\0"):
-            return []  # without the import: most daemons keep none
+            return []  # saves the import: most daemons keep no live maps
         from shmmap.protocol.rows import LiveMapRow
 
         step = self._header.live_row_bytes if self._header is not None else 0
@@ -131,7 +131,7 @@ class Snapshot:
 
 
 def _in_use(kind: type[_Row], data: bytes, step: int) -> list[_Row]:
-    """Read the rows of a table that are in use, but for those that were being changed."""
+    """Return the rows of a table that are in use, except those that were being changed."""
     from shmmap.statistics.rows import unpack_row
 
     found = []

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The daemon's side of the statistics segment.
 
-Counting costs a dictionary access; `StatisticsWriter.beat` writes what changed.  It writes with
-``pwrite`` into memory allocated before: a full file system is an error here, never SIGBUS, and a
-reader that cannot be trusted cannot stop or hurt the writer.  Once the segment is there, what cannot
-be written (a limit on the size of files, say) is logged once, stays due, and stops nothing: the
-statistics serve the operator, the daemon serves without them.
+Counting costs a dictionary access; `StatisticsWriter.beat` writes the changes.  It writes with ``pwrite``
+into memory allocated before: a full file system is an error here, never SIGBUS, and an untrusted reader
+cannot stop or harm the writer.  Once the segment exists, a failed write (because of a limit on file sizes,
+for example) is logged once and retried, and stops nothing: the daemon serves without statistics.
 """
 
 from __future__ import annotations
@@ -60,7 +59,7 @@ _Row = TypeVar("_Row", bound=msgspec.Struct)
 _GROWTH_ROWS = 256  # 64 KiB at a time
 _CLIENTS_A_PAGE = 16
 _RESTORE_AGAIN_S = 5.0
-_COPIED_BYTES = 4 << 20  # of a segment that is made again, in a millisecond
+_COPIED_BYTES = 4 << 20  # per millisecond, of a segment that is created again
 
 
 def _always(nbytes: int) -> bool:
@@ -72,20 +71,20 @@ _LONGEST: Final = {kind: f"longest_turn_{kind}_ns" for kind in TURN_KINDS}
 
 
 class _RowTable(Generic[_Row]):
-    """A small table of the segment: rows of equal length, of which only what changed is written.
+    """A small table of the segment with rows of equal length; only changes are written.
 
-    Memory for them is allocated a page at a time, as they come.
+    Memory for rows is allocated page by page, as needed.
 
     Parameters
     ----------
     place, row_bytes, most
-        Where the table is, how long a row is, and how many there can be.
+        Position of the table, length of a row, and maximum number of rows.
     write
-        Writes bytes at a place; False if that cannot be done.
+        Writes bytes at a position; returns False if that fails.
     allocate
-        Allocates bytes at a place; False if there is no room.
+        Allocates bytes at a position; returns False if there is no room.
     allocated
-        Rows for which there is memory from the start.
+        Number of rows for which memory exists from the start.
     """
 
     def __init__(
@@ -108,7 +107,7 @@ class _RowTable(Generic[_Row]):
         self._rows: list[_Row | None] = []
 
     def show(self, rows: Sequence[_Row]) -> None:
-        """Bring these rows into the table, the first of them if there is no room for all."""
+        """Write these rows to the table, only the first ones if there is no room for all."""
         count = min(len(rows), self._room_for(min(len(rows), self._most)))
         self._rows += [None] * (count - len(self._rows))
         self.used = 0
@@ -134,7 +133,7 @@ class StatisticsWriter:
     Parameters
     ----------
     directory, instance
-        Where the segment goes, in place of what a dead predecessor left.
+        Directory and instance of the segment, which replaces one that a dead predecessor left.
     identity
         The daemon that writes.
     mode, gid
@@ -142,8 +141,8 @@ class StatisticsWriter:
     starting
         The daemon does not listen yet: the gauge of that name is 1 until it is set to 0.
     reserve
-        Asked with a number of bytes before the segment grows (64 KiB at a time); where it answers
-        False, the rows that found no room are counted in ``rows_missing`` and tried again later.
+        Called with a number of bytes before the segment grows (64 KiB at a time).  If it returns False, rows
+        without room are counted in ``rows_missing`` and retried later.
 
     Attributes
     ----------
@@ -153,9 +152,9 @@ class StatisticsWriter:
     Raises
     ------
     OSError
-        If the directory is full.
+        The directory is full.
     InstanceBusy, CannotStart
-        If another daemon has the segment's name, or there is something that cannot be removed.
+        Another daemon has the segment's name, or an existing file cannot be removed.
     """
 
     def __init__(
@@ -175,7 +174,7 @@ class StatisticsWriter:
         self.name = statistics_name(instance)
         self._instance = instance
         self._directory = directory
-        self._successor = -1  # takes the place of a file that others removed, once it has all that this has
+        self._successor = -1  # replaces a file that others removed, once it has all its bytes
         self._restore_s = 0.0
         self._durations = {h.name: [0] * (1 + BUCKETS) for h in HISTOGRAMS}
         self._layout = plan(COUNTERS, HISTOGRAMS)
@@ -202,7 +201,7 @@ class StatisticsWriter:
             self._layout.live_offset, LIVE_ROW_BYTES, MAX_LIVE, self._write, self._allocate
         )
         self._changed: dict[Hashable, CellRow] = {}
-        self._missing: dict[Hashable, CellRow] = {}  # there was no room for these, or no writing them
+        self._missing: dict[Hashable, CellRow] = {}  # no room for these, or writing failed
         self._removed: list[int] = []
         self._is_logged = False
         self._fd = directory.create()
@@ -218,9 +217,9 @@ class StatisticsWriter:
             raise
 
     def _write_first(self, identity: DaemonIdentity) -> None:
-        """Fill the new file, with room for the first rows.
+        """Write the new file, with memory for the first rows.
 
-        So a small daemon never grows after it took its budget.
+        So the segment of a small daemon does not grow after the budget was set.
         """
         start = self._layout.clients_offset + _CLIENTS_A_PAGE * CLIENT_ROW_BYTES
         os.posix_fallocate(self._fd, 0, start)
@@ -251,14 +250,14 @@ class StatisticsWriter:
         values[1 + bucket_of(duration_ns)] += 1
 
     def add_turn(self, kind: str, duration_ns: int) -> None:
-        """Count a turn of the serving loop, named after what took most of it (`TURN_KINDS`)."""
+        """Count a turn of the serving loop, under the work that took most of it (`TURN_KINDS`)."""
         self.add_duration("turn", duration_ns)
         name = _LONGEST[kind]
         if duration_ns > self.values[name]:
             self.values[name] = duration_ns
 
     def map_changed(self) -> None:
-        """Show clients at once that the map has other cells, or a cell another version, than before.
+        """Show clients at once that cells of the map were added, removed or changed.
 
         Call it before any reply or event shows the change.
         """
@@ -279,7 +278,7 @@ class StatisticsWriter:
         (self._missing if key in self._missing else self._changed)[key] = row
 
     def cell_removed(self, key: Hashable) -> None:
-        """Show the row no more; unknown keys are ignored."""
+        """Remove the row; unknown keys are ignored."""
         self._changed.pop(key, None)
         self._missing.pop(key, None)
         slot = self._slots.pop(key, None)
@@ -288,11 +287,11 @@ class StatisticsWriter:
 
     @property
     def outdated(self) -> bool:
-        """Whether cells came, went or changed since the last beat."""
+        """Whether cells were added, removed or changed since the last beat."""
         return bool(self._changed or self._removed)
 
     def update_identity(self, identity: DaemonIdentity) -> None:
-        """Replace what the segment says of its writer, as after a reload.
+        """Replace the identity of the writer in the segment, as after a reload.
 
         Raises
         ------
@@ -335,7 +334,7 @@ class StatisticsWriter:
         """Write at most ``max_rows`` changed rows, between two beats."""
         if not (self._changed or self._removed or self._missing or self._table_sequence % 2):
             return
-        if not self._mark_table(self._table_sequence + 1 | 1):  # odd already where no even one could follow
+        if not self._mark_table(self._table_sequence + 1 | 1):  # already odd after a failed write
             return
         for _ in range(min(max_rows, len(self._removed))):
             if not self._write_row(self._removed[-1], FREE_ROW):
@@ -365,7 +364,7 @@ class StatisticsWriter:
         return self._write(packed, self._layout.rows_offset + slot * CELL_ROW_BYTES)
 
     def _write(self, data: bytes, place: int) -> bool:
-        """Write all of it; False if that cannot be done, and the caller tries again at a later beat."""
+        """Write all the data; return False if that fails, and the caller retries at a later beat."""
         try:
             _write_whole(self._fd, data, place)
         except OSError as error:
@@ -385,7 +384,7 @@ class StatisticsWriter:
         return True
 
     def _slot(self, key: Hashable) -> int | None:
-        """Return the row of ``key``, a new one if needed; None when there is no room."""
+        """Return the slot of ``key``, a new one if needed; None if there is no room."""
         slot = self._slots.get(key)
         if slot is None:
             if self._free:
@@ -409,7 +408,7 @@ class StatisticsWriter:
         return True
 
     def _allocate(self, start: int, nbytes: int) -> bool:
-        """Allocate memory where there is none yet, if the budget and the file system allow."""
+        """Allocate missing memory, if the budget and the file system allow that; return whether it exists."""
         if not self._reserve(nbytes):
             return False
         try:
@@ -419,9 +418,9 @@ class StatisticsWriter:
         return True
 
     def restore(self, now_s: float) -> None:
-        """Make the segment again if others removed its file, a part of it at each call.
+        """Create the segment again if its file was removed, a part at each call.
 
-        What has no name any more cannot get one again: its bytes are copied.
+        A file without a name cannot get one again, so its bytes are copied.
         """
         if self._successor < 0 and (now_s < self._restore_s or self._is_named()):
             return
@@ -448,7 +447,7 @@ class StatisticsWriter:
         hold(self._successor)
 
     def _copy_some(self) -> bool:
-        """Copy a part to the successor; True once it has everything."""
+        """Copy a part to the successor; return True once the copy is complete."""
         at, end = os.lseek(self._successor, 0, os.SEEK_CUR), os.fstat(self._fd).st_size
         return at + os.sendfile(self._successor, self._fd, at, min(end - at, _COPIED_BYTES)) >= end
 
@@ -458,7 +457,7 @@ class StatisticsWriter:
             self._successor = -1
 
     def _is_named(self) -> bool:
-        """Whether the segment's name is that of this file."""
+        """Return whether the segment's name refers to this file."""
         try:
             named = os.stat(self._directory.path + self.name, follow_symlinks=False)
         except OSError:
@@ -471,7 +470,7 @@ class StatisticsWriter:
         return measured_bytes(self._fd) + (measured_bytes(self._successor) if self._successor >= 0 else 0)
 
     def close(self) -> None:
-        """Remove the segment; what else has its name stays."""
+        """Remove the segment; another file that has its name stays."""
         if self._is_named():
             self._directory.unlink(self.name)
         self._give_up_successor()

@@ -106,7 +106,7 @@ class WindowFollower:
         return os.getpid() != self._pid
 
     def answers(self, state: WindowState) -> bool:
-        """Whether a state answers the latest pose."""
+        """Return whether a state answers the latest pose."""
         pose = self._pose
         return pose is not None and not moved(state, pose, self._update_distance)
 
@@ -268,7 +268,7 @@ class BlockingFollower:
         self.stale_since: float | None = None
 
     def answers(self, state: WindowState) -> bool:
-        """Whether a state answers the latest pose."""
+        """Return whether a state answers the latest pose."""
         return self._pose is not None and not moved(state, self._pose, self._update_distance)
 
     def move(self, pose: Intent, wait_s: float | None) -> WindowState:

@@ -39,7 +39,7 @@ class MapWindow:
     The daemon prefetches the cells that the window will need next: along the ``route`` of `move_to`, or
     without a route straight ahead and to both sides.  A radius larger than needed has no benefit.
 
-    After a fork the child can read what the window held, but not move it.
+    After a fork the child can read the window's cells, but not move the window.
 
     Parameters
     ----------

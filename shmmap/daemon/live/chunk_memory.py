@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Chunks in shared memory: created, grown, given up, and found again after the writer died.
+"""Chunks in shared memory: create, grow and retire them, and find them again after the writer died.
 
-A chunk is a file on a tmpfs.  It is mapped once, for the greatest length that a chunk can have; only the
-bytes that the file has may be touched.  (Python's own `mmap` refuses to map more than the file has.)  Memory
-is allocated before it is touched: where there is none, that is an error here and not a signal later.  A file
-grows until its chunk is given up, and is truncated to nothing then: its memory is free at once, whatever
-other processes have open or mapped.
+A chunk is a file on a tmpfs.  It is mapped once, with the maximum length of a chunk; only bytes within the
+file may be accessed.  (Python's own `mmap` refuses to map more than the file's length.)  Memory is allocated
+before it is accessed, so that lack of memory is an error here and not a signal later.  A file grows until its
+chunk is evicted, and is then truncated to nothing: its memory is free at once, even if other processes have
+it open or mapped.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ from shmmap.errors import BadRequest, CannotStart, SegmentCorrupt
 __all__ = ["ChunkFile", "ChunkMemory", "live_prefix", "map_chunk", "memory_bytes", "unmap_chunk", "view_at"]
 
 _GROWTH_BRICKS: Final = 8
-"""A page: memory comes in pages."""
+"""Bricks by which a chunk grows: one page, the unit of allocation."""
 _RECORDS: Final = ("undo", "applied")
-"""What is kept beside the chunks for as long as any of them is in memory."""
+"""Records kept in shared memory as long as any chunk of the map is there."""
 _PROT_READ: Final = 0x1
 _PROT_WRITE: Final = 0x2
 _MAP_SHARED: Final = 0x1
@@ -51,7 +51,7 @@ _libc.munmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t]
 
 
 def live_prefix(instance: str, map_name: str) -> str:
-    """Return what the names of a live map's chunks start with, slash included; no segment's name does."""
+    """Return the prefix of the names of a live map's chunks, slash included; no segment's name has it."""
     return f"/shmmap-live.{instance}.{map_name}."
 
 
@@ -92,11 +92,11 @@ class ChunkFile:
     Attributes
     ----------
     name
-        Of the shared memory, slash included: prefix, key, generation.
+        Name of the shared memory, slash included: prefix, key, generation.
     generation
-        Rises each time that the map brings this chunk into memory.
+        Increases each time that the map loads this chunk into memory.
     view
-        Arrays over the bytes that the file has.
+        Arrays over the bytes of the file.
     """
 
     name: str
@@ -107,7 +107,7 @@ class ChunkFile:
 
     @property
     def nbytes(self) -> int:
-        """Memory that it takes: what the file has, in whole pages."""
+        """Memory of the chunk: the file's length in whole pages."""
         return -(-len(self.view.data) // mmap.PAGESIZE) * mmap.PAGESIZE
 
     def grow(self, bricks: int) -> ChunkView:
@@ -116,7 +116,7 @@ class ChunkFile:
         Raises
         ------
         OSError
-            The file system is full; the chunk is as it was.
+            The file system is full; the chunk is unchanged.
         """
         size = memory_bytes(bricks)
         if size > len(self.view.data):
@@ -125,13 +125,13 @@ class ChunkFile:
         return self.view
 
     def unmap(self) -> int:
-        """Unmap the chunk; nothing of ``view`` may be used any more.  Return its descriptor."""
+        """Unmap the chunk, after which ``view`` must not be used; return its descriptor."""
         self.view = ChunkView(bytearray(HEADER_BYTES))
         unmap_chunk(self._address)
         return self._fd
 
     def close(self) -> None:
-        """Unmap and close the chunk; nothing of ``view`` may be used any more."""
+        """Unmap and close the chunk, after which ``view`` must not be used."""
         os.close(self.unmap())
 
 
@@ -141,16 +141,16 @@ class ChunkMemory:
     Parameters
     ----------
     path
-        A directory on a tmpfs, without huge pages: a chunk would take 2 MiB there.
+        A directory on a tmpfs without huge pages, with which each chunk would take 2 MiB.
     prefix
-        What its names start with, see `live_prefix`.
+        Prefix of the chunks' names, see `live_prefix`.
     mode, gid
         Permissions of the chunks' files; a group of -1 is the process's own.
 
     Attributes
     ----------
     foreign : set
-        Names like those of chunks, of files that belong to another user: they are ignored.
+        Names of files that look like chunks but belong to another user; they are ignored.
     """
 
     def __init__(self, path: str, prefix: str, *, mode: int = 0o600, gid: int = -1) -> None:
@@ -161,7 +161,7 @@ class ChunkMemory:
         self.foreign: set[str] = set()
 
     def close(self) -> None:
-        """Leave the directory; chunks stay, and their records for as long as there are any."""
+        """Close the directory; chunks stay, and the records as long as there are chunks."""
         if not list(self.names()):
             for name in _RECORDS:
                 with contextlib.suppress(FileNotFoundError):
@@ -179,12 +179,12 @@ class ChunkMemory:
         os.fchmod(fd, self._mode)
 
     def record(self, name: str, nbytes: int) -> mmap.mmap:
-        """Map a file that outlives this process, made of zeros if it does not exist yet.
+        """Map a file that outlives this process; create it filled with zeros if it does not exist.
 
         Raises
         ------
         CannotStart
-            Its name belongs to something that is no file of this user, the only one who may write it.
+            Something else has its name, or a file of another user.
         """
         path = self.path + self.prefix + name
         flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
@@ -202,12 +202,12 @@ class ChunkMemory:
             os.close(fd)
 
     def create(self, content: bytes | bytearray) -> ChunkFile:
-        """Put a chunk into memory; it gets its name when it is whole.
+        """Create a chunk in memory; it gets its name when it is complete.
 
         Parameters
         ----------
         content
-            Its header and bricks.
+            Header and bricks of the chunk.
 
         Raises
         ------
@@ -238,7 +238,7 @@ class ChunkMemory:
         Raises
         ------
         SegmentCorrupt
-            It is not the chunk that its name says.
+            The file is not the chunk that its name denotes.
         OSError
             It cannot be opened.
         """
@@ -261,23 +261,23 @@ class ChunkMemory:
         return ChunkFile(name, generation, fd, address, view_at(address, size))
 
     def give_up(self, chunk: ChunkFile) -> None:
-        """Take a chunk out of service, and free its memory, whatever readers do with it.
+        """Evict a chunk and free its memory, even while readers use it.
 
-        A reader in the middle of it finds another ``sequence``, or too few bytes, and begins again.
+        A reader in the middle of the chunk finds another ``sequence`` or too few bytes, and starts again.
         """
         state = chunk.view.state
         state["state"] = OUT_OF_SERVICE
         state["sequence"] += 2
         fd = chunk.unmap()
         try:
-            os.ftruncate(fd, 0)  # before its name goes: else a kill here would leave memory without a name
+            os.ftruncate(fd, 0)  # before the name is removed: a kill here must not leave unnamed memory
         finally:
             os.close(fd)
         with contextlib.suppress(FileNotFoundError):
             self.remove(chunk.name)
 
     def is_given_up(self, name: str) -> bool:
-        """Whether a previous writer had given the chunk of this name up, and only its name is left."""
+        """Return whether a previous writer evicted the chunk of this name, and only the name is left."""
         return os.stat(name.lstrip("/"), dir_fd=self._fd, follow_symlinks=False).st_size == 0
 
     def names(self) -> Iterator[tuple[str, ChunkKey, int]]:
@@ -295,12 +295,12 @@ class ChunkMemory:
                     self.foreign.add(name)
 
     def _is_ours(self, name: str) -> bool:
-        """Whether a file belongs to this process's user; in a sticky directory no other can replace it."""
+        """Return whether this user owns a file; in a sticky directory no other user can replace it."""
         try:
             return os.stat(name, dir_fd=self._fd, follow_symlinks=False).st_uid == os.geteuid()
         except FileNotFoundError:
             return False
 
     def remove(self, name: str) -> None:
-        """Remove the name of a file that is of no use."""
+        """Remove an unusable file."""
         os.unlink(name.lstrip("/"), dir_fd=self._fd)

@@ -35,16 +35,16 @@ __all__ = [
 
 
 class Begin(msgspec.Struct, array_like=True, tag="begin"):
-    """Bring these maps into memory, and serve them.
+    """Load these maps into memory, and serve them.
 
     Attributes
     ----------
     shm_dir, marks_dir
         Directories of chunks, and of mappers' marks.
     budget_bytes
-        Memory of all maps together.
+        Memory budget of all maps together, bytes.
     gid, marks_gid
-        Groups that may read chunks, and that may map; -1: none.
+        Groups whose members may read chunks, and may map; -1: none.
     """
 
     instance: str
@@ -57,7 +57,7 @@ class Begin(msgspec.Struct, array_like=True, tag="begin"):
 
 
 class Ask(msgspec.Struct, array_like=True, tag="ask"):
-    """A client's request as received; ``maps`` says whether this client may change live maps."""
+    """A client's request as received; ``maps`` is whether this client may change live maps."""
 
     ticket: int
     session: int
@@ -73,15 +73,15 @@ class Disconnected(msgspec.Struct, array_like=True, tag="disconnected"):
 
 
 class End(msgspec.Struct, array_like=True, tag="end"):
-    """Save everything and remove all names; or, with ``keep``, leave memory to the next run."""
+    """Save all chunks and remove them from memory; with ``keep``, leave them in memory to the next run."""
 
     keep: bool
 
 
 class Begun(msgspec.Struct, array_like=True, tag="begun"):
-    """Each map is served, or has a problem: how many are served, how many chunks were found in memory.
+    """Each map is served or has a problem; with the number of served maps and of chunks found in memory.
 
-    The error says why none can be served while the settings stay and the other daemon runs.
+    The error is the reason if no map can be served until settings change or another daemon ends.
     """
 
     maps: int
@@ -105,7 +105,7 @@ class Status(msgspec.Struct, array_like=True, tag="status"):
 
 
 class Unsaved(msgspec.Struct, array_like=True, frozen=True):
-    """How many chunks of a map could not be saved and stay in memory, and why."""
+    """Number of chunks of a map that could not be saved and stay in memory, and the reason."""
 
     map: str
     chunks: int
@@ -122,13 +122,13 @@ ToLive: TypeAlias = Begin | Ask | Disconnected | End
 FromLive: TypeAlias = Begun | Reply | Status | Ended
 
 MAX_PER_SESSION: Final = 64
-"""Requests of one session that are passed on and not yet answered."""
+"""Most requests of one session that are forwarded and not yet answered."""
 
 encode: Final = msgspec.msgpack.Encoder().encode
 
 
 def not_served(one: LiveSettings, budget_bytes: int, problem: str) -> LiveMapRow:
-    """Return the state of a map of which nothing is in memory, and why."""
+    """Return the state of a map that is not in memory, with the reason."""
     return LiveMapRow(
         one.name,
         one.path,
@@ -161,10 +161,10 @@ def _from_live() -> msgspec.msgpack.Decoder[FromLive]:
 
 
 def decode_to_live(data: bytes | memoryview) -> ToLive:
-    """Decode a message of the daemon."""
+    """Decode a message from the daemon."""
     return _to_live().decode(data)
 
 
 def decode_from_live(data: bytes | memoryview) -> FromLive:
-    """Decode a message of the worker."""
+    """Decode a message from the worker."""
     return _from_live().decode(data)

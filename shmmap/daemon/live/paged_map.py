@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One live map at work: scans are applied, chunks loaded, saved and given up, as `Residency` says.
+"""One live map: apply scans, and load, save and evict chunks as `Residency` decides.
 
-Only the thread that calls `PagedMap.run_turn` changes chunks; others read, write and flush files.  When this
-process dies, the next one finds the chunks in shared memory: what was *applied* is there, what a scan had
-half done is undone, and the mapper sends that scan again.
+Only the thread that calls `PagedMap.run_turn` changes chunks; other threads read, write and flush files.  If
+this process dies, the next one finds the chunks in shared memory.  Scans that were *applied* are there, a
+partial change by a scan is undone, and the mapper sends that scan again.
 """
 
 from __future__ import annotations
@@ -41,23 +41,23 @@ __all__ = ["FileThreads", "Job", "Observer", "PagedMap"]
 T = TypeVar("T")
 
 THREADS: Final = 4
-"""One of them flushes.  More would wait for each other: between two system calls only one of them runs."""
+"""File threads of a map, one of which flushes.  More threads would only wait for the interpreter lock."""
 CLOSE_S: Final = 5.0
-"""How long files that are being read or written at the end may take; a directory that hangs is abandoned."""
+"""Time for file operations in progress at the end; after that, a directory that hangs is abandoned."""
 FILES_PER_JOB: Final = 8
-"""Files that a thread reads or writes before it reports: a report costs as much as a file."""
+"""Files that a thread reads or writes per report: a report costs as much time as a file."""
 CHUNKS_PER_TURN: Final = 64
-"""Chunks that take in a scan in one turn: 37 us each."""
+"""Chunks to which scans are applied in one turn, 37 us each."""
 LOOK_S: Final = 2.0
-"""How often the directory is checked: it may have been moved or replaced."""
+"""Interval of checks whether the directory was moved or replaced."""
 HANGS_S: Final = 10.0
-"""A disk that has not answered for this long counts as hanging."""
+"""Time without an answer after which a disk counts as hanging."""
 MAX_UNFLUSHED: Final = 32 << 20
-"""Files that are written and not flushed; beyond it nothing more is saved until the disk has caught up."""
+"""Most bytes written and not flushed; beyond that, saving pauses until the disk has caught up."""
 
 
 class Job(NamedTuple):
-    """What a thread does, and what is done with the outcome in a later turn."""
+    """Work for a thread, and the function that gets its outcome in a later turn."""
 
     work: Callable[[], Any]
     then: Callable[[Future[Any], float], None]
@@ -80,15 +80,15 @@ class FileThreads:
 
     @property
     def are_idle(self) -> bool:
-        """Whether everything was done and delivered."""
+        """Whether all jobs are done and their outcomes delivered."""
         return not self._running
 
     def idle_s(self, now_s: float) -> float:
-        """Return for how long no job has been finished although there are some."""
+        """Return how long ago a job last finished, seconds; 0 if there are no jobs."""
         return now_s - self._progress_s if self._running else 0.0
 
     def start(self, jobs: list[Job]) -> None:
-        """Start jobs, several in one thread."""
+        """Start jobs, several per thread."""
         for first in range(0, len(jobs), FILES_PER_JOB):
             some = jobs[first : first + FILES_PER_JOB]
             future = self._threads.submit(_outcomes, [job.work for job in some])
@@ -96,7 +96,7 @@ class FileThreads:
             future.add_done_callback(lambda _future: self._on_done())
 
     def deliver(self, now_s: float) -> None:
-        """Pass on the outcomes of jobs that are done."""
+        """Deliver the outcomes of finished jobs."""
         done = [future for future in self._running if future.done()]
         if done or not self._running:
             self._progress_s = now_s
@@ -105,11 +105,11 @@ class FileThreads:
                 job.then(outcome, now_s)
 
     def wait(self, seconds: float) -> None:
-        """Wait until there are outcomes, for at most these seconds; return at once if no job runs."""
+        """Wait at most ``seconds`` until there are outcomes; return at once if no job runs."""
         wait(list(self._running), timeout=seconds, return_when=FIRST_COMPLETED)
 
     def close(self, seconds: float = CLOSE_S) -> list[Any]:
-        """Wait for all jobs, for at most these seconds; return undelivered results, errors left out."""
+        """Wait at most ``seconds`` for all jobs; return undelivered results without errors."""
         done, _ = wait(list(self._running), timeout=seconds)
         self._threads.shutdown(wait=False, cancel_futures=True)
         outcomes = [outcome for future in done for outcome in future.result()]
@@ -118,36 +118,36 @@ class FileThreads:
 
 
 def _outcomes(works: list[Callable[[], Any]]) -> list[Future[Any]]:
-    """Do one after the other; return the outcome of each."""
+    """Call functions one after the other; return the outcome of each."""
     found: list[Future[Any]] = []
     for work in works:
         outcome: Future[Any] = Future()
         try:
             outcome.set_result(work())
-        except Exception as error:  # noqa: BLE001  raised again when the outcome is looked at
+        except Exception as error:  # noqa: BLE001  raised again when the outcome is read
             outcome.set_exception(error)
         found.append(outcome)
     return found
 
 
 class Observer(Protocol):
-    """Gets what happens to a live map, in the thread of its turns."""
+    """Receives the changes of a live map, in the thread of its turns."""
 
     def scan_applied(self, scan: Scan) -> None:
-        """Note that a scan is in memory that outlives this process."""
+        """Handle that a scan is in memory that outlives this process."""
 
     def scan_durable(self, scan: Scan) -> None:
         """Note that a scan is on the disk."""
 
     def chunk_changed(self, key: ChunkKey) -> None:
-        """Note that a chunk came into memory, or was changed there."""
+        """Handle that a chunk was loaded into memory, or changed there."""
 
     def chunk_gone(self, key: ChunkKey) -> None:
         """Note that a chunk left memory."""
 
 
 class _Part(NamedTuple):
-    """What a scan says of its chunks, by key: first word, end, hits."""
+    """A scan's marks in each chunk, by key: first word, end, hits."""
 
     marks: Marks
     places: dict[ChunkKey, tuple[int, int, int]]
@@ -159,22 +159,23 @@ class PagedMap:
     Parameters
     ----------
     files, memory
-        Where it is on disk and in shared memory.
+        The map on disk and in shared memory.
     limits
-        What it may take.
+        Limits of the map's memory and files.
     observer
-        Gets what happens to scans and chunks.
+        Receives the changes of scans and chunks.
     wake
-        Called, in another thread, when there is something to do in the next turn.
+        Called in another thread when there is work for the next turn.
     codec
         How chunks are compressed on disk.
 
     Attributes
     ----------
     stored : KeyIndex
-        Chunks that have files, in order; one whose file was quarantined is in it until it is loaded.
+        Chunks that have files, in order; a chunk whose file was quarantined stays included until it is
+        loaded.
     problems : dict
-        What keeps chunks from being loaded or saved just now.
+        Problems that keep chunks from being loaded or saved at present.
     saved_s : float
         When a file was written or flushed last.
     """
@@ -217,19 +218,19 @@ class PagedMap:
         """Return the identity of a chunk of this map."""
         return self.files.settings.identity(self.files.map_id, key, generation)
 
-    # --- what a previous writer left ------------------------------------------------------------
+    # --- chunks of a previous writer ------------------------------------------------------------
 
     def adopt(self, now_s: float) -> int:
         """Take over the chunks that a previous writer left in memory; return how many.
 
-        They may be nowhere else.
+        The chunks may exist nowhere else.
 
         Raises
         ------
         CannotStart
             There are unsaved chunks of another map of that name.
         OSError
-            One cannot be opened: it stays where it is, for the next try.
+            A chunk cannot be opened; it stays in memory for the next try.
         """
         memory, undone = self.memory, self._undo.of
         newest: dict[ChunkKey, tuple[int, str]] = {}
@@ -242,7 +243,7 @@ class PagedMap:
                 memory.remove(name)
                 continue
             if newest[key] != (generation, name) or int(chunk.view.state["state"]) == OUT_OF_SERVICE:
-                memory.give_up(chunk)  # it was saved, and about to be given up
+                memory.give_up(chunk)  # it was saved and about to be evicted
                 continue
             try:
                 if undone == (key, generation):
@@ -262,7 +263,7 @@ class PagedMap:
         return len(self.chunks)
 
     def _left_behind(self, name: str) -> ChunkFile | None:
-        """Open a chunk of this map; return None if it is none, raise OSError if it cannot be opened now."""
+        """Open a chunk of this map; return None if it is invalid, raise OSError if it cannot be opened."""
         if self.memory.is_given_up(name):
             return None
         try:
@@ -284,10 +285,10 @@ class PagedMap:
         return None
 
     def add_chunk(self, chunk: ChunkFile, now_s: float) -> None:
-        """Add a whole chunk that is in memory already."""
+        """Add a complete chunk that is in memory already."""
         key, state = chunk.view.identity.key, chunk.view.state
         self.chunks[key] = chunk
-        # its previous writer may have died before it noted that
+        # its previous writer may have died before it recorded that
         saved = state["saved_version"] = self.files.version(key)
         version, active = int(state["version"]), int(state["active"])
         self.residency.adopt(
@@ -321,7 +322,7 @@ class PagedMap:
 
     @property
     def all_durable(self) -> bool:
-        """Whether everything that came is on the disk."""
+        """Whether all accepted scans are on disk."""
         return not self._parts and self.residency.all_durable
 
     def not_durable(self) -> list[tuple[Chunk, int]]:
@@ -330,7 +331,7 @@ class PagedMap:
 
     @property
     def unsaved(self) -> int:
-        """Number of chunks that are in memory alone."""
+        """Number of chunks that are only in memory."""
         return sum(chunk.version > chunk.saved for chunk in self.residency.chunks.values())
 
     def run_turn(self, now_s: float, now_ns: int, *, save_all: bool = False) -> None:
@@ -340,7 +341,7 @@ class PagedMap:
         residency = self.residency
         for chunk, scan in residency.ready()[:CHUNKS_PER_TURN]:
             self._apply(chunk, scan, now_s, now_ns)
-        while (gone := residency.next_eviction(now_s)) is not None:  # now there is room for others
+        while (gone := residency.next_eviction(now_s)) is not None:  # now there is memory for others
             self.memory.give_up(self.chunks.pop(gone.key))
             self._observer.chunk_gone(gone.key)
         jobs = []
@@ -377,7 +378,7 @@ class PagedMap:
         self._note("moved", text)
 
     def _note(self, what: str, problem: str) -> None:
-        """Note a problem, or that it has passed; logged once."""
+        """Record a problem or its end; logged once."""
         if problem and what not in self.problems:
             log.error("live map has a problem", reason=problem)
         if problem:
@@ -386,11 +387,11 @@ class PagedMap:
             log.info("live map is in order again", what=what)
 
     def on_disk(self, work: Callable[[], T], then: Callable[[Future[T], float], None]) -> None:
-        """Do something in a file thread; ``then`` gets the outcome in a later turn."""
+        """Call ``work`` in a file thread; ``then`` gets the outcome in a later turn."""
         self._threads.start([Job(work, then)])
 
     def wait(self, seconds: float) -> None:
-        """Wait until a file was read or written, for at most these seconds; return at once if none is."""
+        """Wait at most ``seconds`` until a file was read or written; return at once if no job runs."""
         self._threads.wait(seconds)
 
     # --- applying -------------------------------------------------------------------------------
@@ -416,7 +417,7 @@ class PagedMap:
                 grow=file.grow,
                 known_mappers=known,
             )
-        except OSError as error:  # no memory: as if the budget did not allow it
+        except OSError as error:  # no memory: treated as if the budget did not allow it
             log.warning("chunk cannot grow", chunk=chunk.key.text, reason=error.strerror)
             self.residency.may_grow(chunk, self.limits.budget_bytes)
             return
@@ -435,7 +436,7 @@ class PagedMap:
     # --- files ----------------------------------------------------------------------------------
 
     def _load(self, identity: ChunkIdentity) -> ChunkFile:
-        """Bring a chunk into memory as in its file, or new; quarantine a file that is of no use."""
+        """Load a chunk from its file, or create it; quarantine an unusable file."""
         key = identity.key
         content: bytes | bytearray = new_header(identity)
         try:
@@ -479,11 +480,11 @@ class PagedMap:
 
     @property
     def problem(self) -> str:
-        """What keeps chunks from being loaded or saved just now; empty for nothing."""
+        """The problem that keeps chunks from being loaded or saved at present; empty if there is none."""
         return "; ".join(self.problems.values())
 
     def _failed(self, what: str, key: str, reason: str | None) -> None:
-        if what not in self.problems:  # logged once: it is tried again each second
+        if what not in self.problems:  # logged once: it is retried each second
             log.warning(f"chunk not {what}", chunk=key or None, reason=reason)
         self.problems[what] = f"chunk {key} cannot be {what}: {reason}" if key else f"not {what}: {reason}"
 
@@ -515,14 +516,14 @@ class PagedMap:
     # --- the end --------------------------------------------------------------------------------
 
     def finish(self, applied: dict[int, int] | None) -> None:
-        """Write the manifest, and remove spare files, before the end."""
+        """Write the manifest and remove spare files, at the end."""
         self._threads.start([Job(partial(self._finish, applied), self._listed)])
         while not self._threads.are_idle and (left_s := self._left_s()) > 0:
             self._threads.wait(left_s)
             self._threads.deliver(time.monotonic())
 
     def _left_s(self) -> float:
-        """Return how long files may still take at the end, counted from the first call."""
+        """Return the time left for files at the end, seconds, counted from the first call."""
         if self._end_s is None:
             self._end_s = time.monotonic() + (0.0 if "hangs" in self.problems else CLOSE_S)
         return max(0.0, self._end_s - time.monotonic())
@@ -532,16 +533,16 @@ class PagedMap:
         self.files.remove_spare()
 
     def remove_from_memory(self) -> None:
-        """Give all chunks up."""
+        """Evict all chunks."""
         for file in self.chunks.values():
             self.memory.give_up(file)
         self.chunks.clear()
 
     def close(self) -> None:
-        """Leave memory and files as they are."""
+        """Close the map; memory and files stay as they are."""
         for done in self._threads.close(self._left_s()):
             if isinstance(done, ChunkFile):
-                done.close()  # it was loaded after the last turn
+                done.close()  # loaded after the last turn
         for file in self.chunks.values():
             file.close()
         self.chunks.clear()

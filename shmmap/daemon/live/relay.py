@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The daemon's side of the live worker: passes requests on to it, and its answers back.
+"""The daemon's side of the live worker: forwards requests to it, and its answers to clients.
 
-What happens to live maps it reports as events and in the statistics: what changed since the last look.
+It publishes changes of live maps as events and in the statistics.
 
-A worker that dies loses nothing that was answered: another one is started, which finds the chunks in memory.
-Requests that it had not answered are refused, and their clients ask again.
+A worker that dies loses nothing that it had answered: a new worker is started, which finds the chunks in
+memory.  Unanswered requests are refused, and their clients repeat them.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ _CHUNK: Final = re.compile(r"chunk -?\d+_-?\d+_-?\d+")
 
 @dataclass(eq=False, slots=True)
 class LiveEvents:
-    """Reports how live maps are, and the process that keeps them.
+    """Reports the state of live maps, and of the process that keeps them.
 
-    Until `begin` nothing is an event: the first one is that of the daemon's start.
+    No event is published before `begin`, since the first event must be that of the daemon's start.
     """
 
     event_log: EventLog
@@ -55,13 +55,13 @@ class LiveEvents:
     _begun: bool = False
 
     def begin(self, maps: int) -> None:
-        """Publish events from now on, beginning with how things are with these ``maps`` (their number)."""
+        """Publish events from now on, beginning with the present state of ``maps`` (number of maps)."""
         self._begun = True
         self.started(maps, self._adopted)
         self._publish_changes()
 
     def started(self, maps: int, adopted: int) -> None:
-        """Report that the process serves ``maps``, of which ``adopted`` chunks were in memory (numbers)."""
+        """Report that the process serves ``maps`` maps, and found ``adopted`` chunks in memory."""
         self._adopted = adopted
         if self._begun:
             self.event_log.publish(events.LiveStarted, maps, adopted)
@@ -77,14 +77,14 @@ class LiveEvents:
         self.statistics.beat()
 
     def update(self, rows: Sequence[LiveMapRow]) -> None:
-        """Report how the maps are now."""
+        """Report the present state of the maps."""
         self._rows = {row.name: row for row in rows}
         self.statistics.show_live_maps(rows)
         if self._begun:
             self._publish_changes()
 
     def _publish_changes(self) -> None:
-        """Publish what is different from what was published last."""
+        """Publish the changes since the last publication."""
         for name, row in self._rows.items():
             before = self._published.get(name)
             known = before.damaged if before is not None else ()
@@ -99,38 +99,38 @@ class LiveEvents:
 
 
 def _cause(problem: str) -> str:
-    """Return what is wrong, whichever chunk met it first."""
+    """Return the cause of a problem, without the chunk that met it first."""
     return _CHUNK.sub("chunk", problem)
 
 
 BEAT_S: Final = 0.5
 START_END_S: Final = 2.0
-"""How long a worker that does not serve yet may take to end."""
+"""Time for a worker that does not serve yet to end."""
 END_S: Final = 60.0
-"""How long saving everything may take at the end; the unit's stop timeout is longer."""
+"""Time for saving all chunks at the end; the unit's stop timeout is longer."""
 PAUSES_S: Final = (0.0, 0.5, 2.0, 10.0, 30.0)
-"""Pauses before another worker is started: after the first one that ended, and the next ones in a row."""
+"""Pauses before a new worker is started: after the first failure, and after the next ones in a row."""
 STARTS: Final = 2
-"""Workers that may be killed before the maps are in memory."""
+"""How many workers may be killed before the maps are in memory."""
 KILL_TIMEOUT_S: Final = 0.1
-"""How long the loop waits for a killed worker to end; one that hangs in the kernel may never end."""
+"""How long the loop waits for a killed worker to end; a worker that hangs in the kernel may never end."""
 MESSAGES_PER_TURN: Final = 16
-"""Messages of the worker that one turn of the loop takes in."""
+"""Messages from the worker that one turn of the loop handles."""
 MAX_BYTES: Final = 1 << 12
-"""Length of a request about live maps: names and numbers."""
+"""Maximum length of a request about live maps, which consists of names and numbers."""
 MAX_UNSENT: Final = 4096
-"""Messages for a worker that reads nothing just now: sessions that come and go could send without end."""
+"""Most messages queued for a worker that does not read: new sessions could send without bound."""
 STABLE_S: Final = 1.0
-"""A worker that ends sooner after its maps were in memory is not started again at once a second time."""
+"""Run time below which a worker counts as failed: it is restarted at once only the first time."""
 MAX_PER_PROCESS: Final = 256
 MAX_WAITING: Final = 4096
-"""Requests of one process, and of all, that wait for their answers."""
+"""Most requests that wait for their answers, of one process and of all."""
 REFUSED_PER_TURN: Final = 64
 """Requests that one turn of the loop refuses after a worker has ended."""
 
 
 class Tickets:
-    """Requests that were passed on and are not answered: bounded by session, by process, and in all."""
+    """Forwarded requests without an answer: bounded by session, by process, and in total."""
 
     def __init__(self) -> None:
         self._asked: dict[int, tuple[Session, int]] = {}
@@ -158,7 +158,7 @@ class Tickets:
         return self._last
 
     def take(self, ticket: int) -> Session | None:
-        """Return the session to answer; None if it has ended."""
+        """Remove a ticket and return its session; None if the session has ended."""
         session, _ = self._asked.pop(ticket, (None, 0))
         if session is not None:
             self._of[session.slot].discard(ticket)
@@ -177,7 +177,7 @@ class Tickets:
             self._lost = deque(row for row in self._lost if row[0] is not session)
 
     def lose(self) -> None:
-        """Note that the worker has ended: `refuse_some` refuses everything that waits."""
+        """Record that the worker has ended: `refuse_some` then refuses all waiting requests."""
         self._lost += self._asked.values()
         self._asked = {}
         self._of.clear()
@@ -197,13 +197,13 @@ class Tickets:
 
 
 class NoLiveMaps:
-    """Stands in for `LiveRelay` in a daemon that keeps no live maps."""
+    """Replacement for `LiveRelay` in a daemon without live maps."""
 
     def begin_events(self) -> None:
         """Do nothing."""
 
     def ask(self, session: Session, message: LiveRequest, body: bytes, now_s: float) -> None:
-        """Refuse a request, or list no maps."""
+        """Refuse a request; a request for the list gets an empty list."""
         del body, now_s
         if isinstance(message, LiveList):
             session.connection.reply(encode(LiveListed(message.request, ())))
@@ -221,7 +221,7 @@ class NoLiveMaps:
 
     @property
     def next_s(self) -> float:
-        """Return infinity: nothing is ever due."""
+        """Infinity: nothing is ever due."""
         return math.inf
 
     def run_step(self, now_s: float) -> None:
@@ -232,30 +232,30 @@ class NoLiveMaps:
 
     @property
     def unsaved(self) -> dict[str, int]:
-        """Return that nothing is unsaved."""
+        """Empty: nothing is unsaved."""
         return {}
 
 
 class LiveRelay:
-    """Starts the live worker, and passes on what concerns it.
+    """Starts the live worker, and forwards messages to and from it.
 
     Parameters
     ----------
     begin
-        Which maps the worker keeps, and where.
+        Message with the worker's maps and directories.
     watched
         Watches the worker's channel.
     may_map
-        Whether a process may change live maps.
+        Returns whether a process may change live maps.
     events
-        Gets the state of the maps, twice a second, and when the worker ends and begins.
+        Receives the state of the maps twice a second, and starts and ends of the worker.
 
     Attributes
     ----------
     restarts : int
-        Workers that ended without being asked to.
+        Number of workers that ended unexpectedly.
     unsaved : dict
-        Chunks by map that could not be saved at the end.
+        Number of chunks, by map, that could not be saved at the end.
     """
 
     def __init__(
@@ -296,19 +296,19 @@ class LiveRelay:
         self._watched.watch(self._channel.fileno(), self.on_readable, "answers")
 
     def wait_until_serving(self, seconds: float, *, alone: bool) -> None:
-        """Wait until each map is in memory or has a problem; maps that take longer come later.
+        """Wait until each map is in memory or has a problem; maps that take longer are served later.
 
         Parameters
         ----------
         seconds
-            How long points may have to wait for live maps.
+            How long the daemon's point maps may wait for live maps.
         alone
-            There is nothing else to serve.
+            The daemon has nothing else to serve.
 
         Raises
         ------
         ShmmapError
-            There is nothing else, and settings or another daemon keep every map from being served.
+            ``alone`` is true, and settings or another daemon prevent every map from being served.
         """
         end_s = time.monotonic() + seconds
         while not self._serving and (left_s := end_s - time.monotonic()) > 0:
@@ -326,7 +326,7 @@ class LiveRelay:
             self._show_problem("the process that keeps live maps is being started")
 
     def _show_problem(self, problem: str) -> None:
-        """Show each map as not served just now."""
+        """Show each map as not served at present."""
         budget_bytes = self._begin.budget_bytes // max(1, len(self._begin.maps))
         self._rows = tuple(messages.not_served(one, budget_bytes, problem) for one in self._begin.maps)
         self._events.update(self._rows)
@@ -336,14 +336,14 @@ class LiveRelay:
         self._events.begin(len(self._begin.maps))
 
     def _wait(self, seconds: float) -> None:
-        """Wait until the worker sends something, or takes what is to be sent."""
+        """Wait until the worker's channel is readable, or writable if messages are queued."""
         if self._channel is not None:
             poller = select.poll()  # `select.select` takes no descriptor above 1023
             poller.register(self._channel, select.POLLIN | (select.POLLOUT if self._unsent else 0))
             poller.poll(seconds * 1000)
 
     def beat(self, now_s: float) -> None:
-        """Start another worker when it is due."""
+        """Start a new worker when it is due."""
         if self._channel is None and now_s >= self._start_s:
             try:
                 self.start()
@@ -352,7 +352,7 @@ class LiveRelay:
                 log.warning("live worker not started", reason=error.strerror)
 
     def on_readable(self) -> None:
-        """Take in messages of the worker, and send what it did not take before."""
+        """Handle messages from the worker, and send queued ones."""
         for _ in range(MESSAGES_PER_TURN):
             if self._channel is None:
                 return
@@ -387,29 +387,29 @@ class LiveRelay:
             self._ended = message
 
     def _lost(self) -> None:
-        """Note that the worker has ended: refuse what waits, and start another one soon."""
+        """Handle the worker's end: refuse waiting requests, and start a new worker soon."""
         now_s = time.monotonic()
         if self._serving and now_s >= self._served_s + STABLE_S:
             self._failures = 0
         self._forget()
         if self._ended is not None:
-            return  # as it was asked to
+            return  # as requested
         self.restarts += 1
         self._start_s = now_s + PAUSES_S[min(self._failures, len(PAUSES_S) - 1)]
         self._failures += 1
         log.error("live worker ended", restarts=self.restarts)
         self._events.ended(self.restarts)
-        if self._failures > 1:  # once is hardly noticed: the next one finds what was in memory
+        if self._failures > 1:  # a single failure is harmless: chunks stay in memory
             self._show_problem("the process of the live maps keeps ending: see the log")
         self._tickets.lose()
 
     @property
     def next_s(self) -> float:
-        """When the next step is due: at once while requests to a worker that ended are left, else never."""
+        """Time of the next step: now while requests to an ended worker are left, else infinity."""
         return 0.0 if self._tickets.are_lost else math.inf
 
     def run_step(self, now_s: float) -> None:
-        """Refuse some of the requests to a worker that ended."""
+        """Refuse some of the requests to a worker that has ended."""
         del now_s
         self._tickets.refuse_some()
 
@@ -429,16 +429,16 @@ class LiveRelay:
     # --- requests -------------------------------------------------------------------------------
 
     def ask(self, session: Session, message: LiveRequest, body: bytes, now_s: float) -> None:
-        """Pass a request on.
+        """Forward a request.
 
         Raises
         ------
         Busy
-            Too many requests of this session wait, or of its process, or of all.
+            Too many requests wait: of this session, of its process, or in total.
         BadRequest
-            It is too long.
+            The request is too long.
         LiveInterrupted
-            There is no worker just now.
+            There is no worker at present.
         """
         if len(body) > MAX_BYTES:
             raise BadRequest(f"a request about a live map has at most {MAX_BYTES} bytes")
@@ -458,7 +458,7 @@ class LiveRelay:
         self._send(messages.Ask(ticket, session.slot, session.peer.uid, maps, bytes(body)))
 
     def on_disconnect(self, session: Session) -> None:
-        """Note that a session has ended."""
+        """Handle the end of a session."""
         self._tickets.on_disconnect(session)
         if session.slot in self._known_sessions:
             self._known_sessions.discard(session.slot)
@@ -470,7 +470,7 @@ class LiveRelay:
         self._flush()
 
     def _flush(self) -> None:
-        """Send what the worker takes; the rest when it has read some."""
+        """Send queued messages until the channel is full; the rest later."""
         if self._channel is None:
             return
         try:
@@ -480,19 +480,19 @@ class LiveRelay:
         except BlockingIOError:
             pass
         except OSError:
-            return  # it has ended: `on_readable` notices
+            return  # the worker has ended, which `on_readable` handles
         self._watched.watch_for(self._channel.fileno(), reading=True, writing=bool(self._unsent))
 
     # --- the end --------------------------------------------------------------------------------
 
     def close(self, *, keep: bool) -> None:
-        """Save everything and remove all names, or leave memory to the next run.
+        """Save all chunks and remove them from memory; with ``keep``, leave them to the next run.
 
-        What could not be saved stays in memory, and is listed in `unsaved`.
+        Chunks that could not be saved stay in memory, and are listed in `unsaved`.
         """
         end_s = time.monotonic() + END_S
         ended, was_serving = None, False
-        for _ in range(2):  # if a worker dies meanwhile, another one takes its chunks over
+        for _ in range(2):  # if a worker dies meanwhile, a new one takes over its chunks
             if self._served_s and not self._serving and self._ended is None and not keep:
                 self._start_to_save(end_s)
             if self._channel is None:
@@ -518,7 +518,7 @@ class LiveRelay:
         self._forget()
 
     def _start_to_save(self, end_s: float) -> None:
-        """Start another worker, which takes over what the last one left in memory."""
+        """Start a new worker, which takes over the chunks that the last one left in memory."""
         if self._channel is None:
             try:
                 self.start()
@@ -531,7 +531,7 @@ class LiveRelay:
             log.error("live worker does not start: what is in memory stays there for the next start")
 
     def _ask_to_end(self, end_s: float, *, keep: bool) -> messages.Ended | None:
-        """Make the worker end by a time; return its last message, if there is one."""
+        """Make the worker end before ``end_s``; return its last message, if there is one."""
         self._ended = None
         self._unsent.append(messages.encode(messages.End(keep)))
         while self._channel is not None and self._ended is None and (left_s := end_s - time.monotonic()) > 0:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Export the voxels of a live map's files as a cloud, or as a divided map that can be served.
 
-A point lies in the middle of its voxel.  Its ``intensity`` is the probability that the voxel is occupied.
+A point lies at the centre of its voxel.  Its ``intensity`` is the probability that the voxel is occupied.
 Chunks are read and written one by one.
 """
 
@@ -46,17 +46,17 @@ class ExportedVoxels(msgspec.Struct, frozen=True):
     Attributes
     ----------
     voxels, chunks
-        How many voxels, and of how many chunks.
+        Number of exported voxels, and of chunks that contain them.
     cells
         Cells of a divided map, else 0.
     resolution, frame_id
         Edge of a voxel, metres; frame of the live map.
     origin
-        Add it to a point to get back to that frame, metres.
+        Offset from exported points to that frame, metres.
     fields
         Names and dtypes of the columns.
     quarantined
-        Files that are left out because they were quarantined before.
+        Number of files left out because they were quarantined before.
     """
 
     path: str
@@ -81,25 +81,25 @@ def export(
     cell_size: float = 20.0,
     force: bool = False,
 ) -> ExportedVoxels | None:
-    """Write voxels to ``out``, which appears complete or not at all; return None if there is none to write.
+    """Write voxels to ``out``, which appears complete or not at all; return None if there are no voxels.
 
     Parameters
     ----------
     stored
-        The live map; a daemon may be working with it.
+        The live map; a daemon may be using it.
     voxels
-        Which ones; those that are known and neither occupied nor free are left out.
+        Kind of voxels; known voxels that are neither occupied nor free are left out.
     translate
         As in `DivideSettings`.
     cell_size
-        Of a divided map, metres.
+        Edge of the cells of a divided map, metres.
     force
-        Replace what exists; a directory only if it is a divided map.
+        Replace an existing file, or a directory if it is a divided map.
 
     Raises
     ------
     BadRequest
-        There is something at ``out``, or a setting makes no sense.
+        ``out`` exists, or a setting is invalid.
     MapDataError
         A chunk's file is damaged.
     CannotWrite
@@ -118,7 +118,7 @@ def export(
         _bounds(keys, stored.settings.resolution),
         np.dtype(np.float64),
         lattice,
-        "none" if kind == "map" else translate,  # dividing translates, and writes down by what
+        "none" if kind == "map" else translate,  # dividing translates, and records the offset
     )
     if kind == "map":
         return _export_map(stored, path, keys, voxels, frame, translate, cell_size, force)
@@ -178,7 +178,7 @@ def _exported(
 
 
 def _keys(stored: StoredMap, voxels: Voxels) -> list[ChunkKey]:
-    """Return the chunks that have such voxels, by the headers of their files."""
+    """Return the chunks that contain such voxels, according to their files' headers."""
 
     def has_some(header: ChunkFileHeader) -> bool:
         counted = {
@@ -203,7 +203,7 @@ def _row(frame: Frame) -> np.dtype[np.void]:
 def _points(
     key: ChunkKey, view: ChunkView, resolution: float, voxels: Voxels, frame: Frame
 ) -> NDArray[np.void]:
-    """Return the voxels of a chunk, in the order of their places."""
+    """Return the voxels of a chunk as points, ordered by position."""
     identity = view.identity
     log_odds = view.dense()
     chosen = np.zeros(len(log_odds), bool)
@@ -233,9 +233,9 @@ def _write_cloud(
     *,
     replace: bool,
 ) -> tuple[int, int]:
-    """Write a file; return how many voxels it has, and of how many chunks.
+    """Write a file; return the number of voxels in it, and of their chunks.
 
-    Its header has that number, and is written last, in the room that was left for it.
+    The header, which contains the number of voxels, is written last, into space reserved for it.
     """
     header = _header_of(kind, _row(frame), stored, frame)
     room = len(header(_MAX_POINTS, 0))
@@ -256,7 +256,7 @@ def _write_cloud(
 def _header_of(
     kind: Format, row: np.dtype[np.void], stored: StoredMap, frame: Frame
 ) -> Callable[[int, int], bytes]:
-    """Return a function that makes a header, given the number of points and its own length."""
+    """Return a function that makes a header from the number of points and the header's length."""
     fields: list[tuple[str, np.dtype[Any]]] = [(name, row[name]) for name in row.names or ()]
     if kind == "ply":
         origin = " ".join(f"{part:.17g}" for part in frame.origin)

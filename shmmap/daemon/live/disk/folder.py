@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The few operations on the files of a live map, one system call each.
+"""Basic operations on the files of a live map, one system call each.
 
-Content is on the disk after `Folder.sync`, and a file's name after `Folder.sync_names`.  Before that a power
-cut may leave either as it was, or any part of a file's new content.
+A file's content is on disk after `Folder.sync`, its name after `Folder.sync_names`.  Before that, a power cut
+may leave the old content or name, or any part of the new content.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ __all__ = [
 ]
 
 INTERIM: Final = ".tmp"
-"""Suffix of a file that does not have its own name yet; its interim name begins with a dot."""
+"""Suffix of a file that does not have its final name yet; its interim name begins with a dot."""
 DAMAGED: Final = ".damaged."
-"""Between a quarantined file's original name and a number."""
+"""Infix between a quarantined file's original name and a number."""
 MAX_BYTES: Final = 1 << 28
-"""Bytes that are read of any file: more than an undamaged one can have."""
+"""Most bytes that are read from a file: more than an undamaged file can have."""
 
 
 _libc: Final = ctypes.CDLL(None, use_errno=True)
@@ -57,22 +57,22 @@ class FilesToRead(Protocol):
 
 
 class Files(FilesToRead, Protocol):
-    """Files in one directory that may be changed, too."""
+    """Files in one directory, by name, for reading and writing."""
 
     def write(self, name: str, data: bytes) -> None:
         """Create a file."""
 
     def overwrite(self, name: str, data: bytes) -> None:
-        """Write over a file that is not needed; if that fails it has some of both contents."""
+        """Overwrite an unneeded file; after a failure it has a mixture of both contents."""
 
     def sync(self, name: str) -> None:
         """Flush a file's content to the disk."""
 
     def exchange(self, one: str, other: str) -> None:
-        """Exchange the names of two files atomically; raise OSError where the file system cannot."""
+        """Exchange the names of two files atomically; raise OSError if the file system cannot."""
 
     def rename(self, old: str, new: str) -> None:
-        """Rename a file, in the place of what has the new name."""
+        """Rename a file, replacing any file that has the new name."""
 
     def remove(self, name: str) -> None:
         """Remove a file."""
@@ -81,11 +81,11 @@ class Files(FilesToRead, Protocol):
         """Flush all names to the disk."""
 
     def moved(self) -> str:
-        """Return what became of the directory, if it is not where it was opened; else empty."""
+        """Return what happened to the directory if it is no longer at its path; else an empty string."""
 
 
 def write_beside(files: Files, name: str, data: bytes) -> str:
-    """Write a file that is to get this name under an interim one; return that."""
+    """Write a file for this name under an interim name; return the interim name."""
     interim = f".{name}.{secrets.token_hex(4)}{INTERIM}"
     try:
         files.write(interim, data)
@@ -97,7 +97,7 @@ def write_beside(files: Files, name: str, data: bytes) -> str:
 
 
 def replace_file(files: Files, name: str, data: bytes) -> None:
-    """Write a file to the disk, in the place of what has its name; `sync_names` makes the name durable."""
+    """Write a file to disk, replacing any file of its name; `sync_names` makes the name durable."""
     interim = write_beside(files, name, data)
     try:
         files.sync(interim)
@@ -109,7 +109,7 @@ def replace_file(files: Files, name: str, data: bytes) -> None:
 
 
 def quarantine(files: Files, name: str) -> str:
-    """Give a damaged file another name, which is on the disk when this returns it."""
+    """Rename a damaged file to a quarantine name, durably; return that name."""
     taken = set(files.names())
     other = next(one for number in count(1) if (one := f"{name}{DAMAGED}{number}") not in taken)
     files.rename(name, other)
@@ -124,11 +124,11 @@ _KINDS: Final = {
     stat.S_IFCHR: "a device",
     stat.S_IFBLK: "a device",
 }
-"""What is no regular file."""
+"""Descriptions of files that are not regular, by type."""
 
 
 class FolderToRead:
-    """Files of a directory that another process may be changing: each is read whole, as at one moment.
+    """Files of a directory that another process may be changing: each read returns one consistent version.
 
     Raises
     ------
@@ -153,7 +153,7 @@ class FolderToRead:
         return os.stat(name, dir_fd=self._fd, follow_symlinks=False).st_size
 
     def _open(self, name: str, flags: int) -> int:
-        # a pipe or a device of that name would keep the opener waiting
+        # a pipe or a device of that name would block the opener
         flags |= os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY
         try:
             return os.open(name, flags, 0o600, dir_fd=self._fd)
@@ -179,17 +179,17 @@ class FolderToRead:
                 after = os.fstat(fd)
                 if (before.st_mtime_ns, before.st_size) == (after.st_mtime_ns, after.st_size):
                     return b"".join(parts)
-            finally:  # else another file has the name now, and this one was written over
+            finally:  # otherwise another file has the name now, and this one was overwritten
                 os.close(fd)
 
 
 class Folder(FolderToRead):
-    """Files of a directory that no other process works with: it is locked until it is closed.
+    """Files of a directory that is locked against other processes until it is closed.
 
     Parameters
     ----------
     path
-        Created if it is missing, for this user alone.
+        Path of the directory; created if it is missing, for this user alone.
 
     Raises
     ------
@@ -219,7 +219,7 @@ class Folder(FolderToRead):
         self._write(self._open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL), data)
 
     def overwrite(self, name: str, data: bytes) -> None:
-        """Write over a file that is not needed; if that fails it has some of both contents."""
+        """Overwrite an unneeded file; after a failure it has a mixture of both contents."""
         self._write(self._open(name, os.O_WRONLY), data)
 
     def _write(self, fd: int, data: bytes) -> None:
@@ -242,7 +242,7 @@ class Folder(FolderToRead):
             os.close(fd)
 
     def exchange(self, one: str, other: str) -> None:
-        """Exchange the names of two files atomically; raise OSError where the file system cannot."""
+        """Exchange the names of two files atomically; raise OSError if the file system cannot."""
         swap = getattr(_libc, "renameat2", None)
         if swap is None:
             raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
@@ -251,7 +251,7 @@ class Folder(FolderToRead):
             raise OSError(number, os.strerror(number), one)
 
     def rename(self, old: str, new: str) -> None:
-        """Rename a file, in the place of what has the new name."""
+        """Rename a file, replacing any file that has the new name."""
         os.rename(old, new, src_dir_fd=self._fd, dst_dir_fd=self._fd)
 
     def remove(self, name: str) -> None:
@@ -263,7 +263,7 @@ class Folder(FolderToRead):
         os.fsync(self._fd)
 
     def moved(self) -> str:
-        """Return what became of the directory, if it is not where it was opened; else empty."""
+        """Return what happened to the directory if it is no longer at its path; else an empty string."""
         try:
             status = os.stat(self.path)
         except (FileNotFoundError, NotADirectoryError):

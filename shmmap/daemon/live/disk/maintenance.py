@@ -38,7 +38,7 @@ __all__ = [
 
 
 class DamagedFile(msgspec.Struct):
-    """A file that is not as it was written; ``kept_as`` is its name in quarantine, empty if it has none."""
+    """A damaged file; ``kept_as`` is its name in quarantine, empty if it is not quarantined."""
 
     file: str
     reason: str
@@ -46,7 +46,7 @@ class DamagedFile(msgspec.Struct):
 
 
 class MissingChunk(msgspec.Struct, frozen=True):
-    """A chunk whose saved ``version`` is gone; the version ``found`` is on the disk now, 0 for none."""
+    """A chunk whose saved ``version`` is lost; ``found`` is the version on disk now, 0 for none."""
 
     chunk: str
     version: int
@@ -63,18 +63,18 @@ class CheckedMap(msgspec.Struct):
     rows
         The good chunks.
     unreadable
-        Files that the system does not let this process read, or that are no regular ones, and why: they may
-        be good.  `repair` quarantines them, too.
+        Files that this process may not read, or that are not regular, with the reason: they may be undamaged.
+        `repair` quarantines them, too.
     missing
-        What the manifest lists beyond the files.
+        Chunks or versions in the manifest for which there is no file.
     manifest
-        ``stale`` if it does not list the chunks as the files have them: as after a daemon was killed.
+        ``stale`` if its list of chunks differs from the files, as after a daemon was killed.
     interim
-        Files that did not get their own names: the daemon takes over the good ones at its next start.
+        Files still under interim names: the daemon takes over the good ones at its next start.
     quarantined
         Files that were quarantined before.
     strange
-        Files named like those of chunks, but of chunks that cannot be.
+        Files named like chunks, but with impossible keys.
     rewritten
         Whether a new manifest was written.
     """
@@ -95,7 +95,7 @@ class CheckedMap(msgspec.Struct):
 
     @property
     def good(self) -> bool:
-        """Whether everything that was saved is on the disk."""
+        """Whether all that was saved is on disk, undamaged."""
         return not (self.damaged or self.unreadable or self.missing or self.manifest == "unreadable")
 
     def total(self, what: Literal["bytes", "active", "occupied", "free", "bricks"]) -> int:
@@ -104,16 +104,16 @@ class CheckedMap(msgspec.Struct):
 
 
 def check(files: FilesToRead, path: str) -> CheckedMap:
-    """Read every chunk whole; nothing is changed, and others may be working with the files.
+    """Read every chunk completely, without changing anything; other processes may be using the files.
 
     Raises
     ------
     MapDataError
-        ``map.json`` is not what it should be.
+        ``map.json`` is damaged or invalid.
     PackageMissing
         A chunk is compressed by a package that is not installed.
     """
-    listed = _listed(files)  # before the files, which only get newer
+    listed = _listed(files)  # before the files, since files only get newer
     stored = StoredMap(files, path)
     rows: dict[ChunkKey, Row] = {}
     damaged: list[DamagedFile] = []
@@ -126,7 +126,7 @@ def check(files: FilesToRead, path: str) -> CheckedMap:
         reason = row.message.removeprefix(f"{row.path}: ")
         if row.cause == "unreadable":
             unreadable[name] = reason
-        elif row.cause != "missing":  # since the names were listed
+        elif row.cause != "missing":  # removed since the names were listed
             damaged.append(DamagedFile(name, reason))
     known = {one.file for one in damaged} | unreadable.keys()
     interim = []
@@ -134,7 +134,7 @@ def check(files: FilesToRead, path: str) -> CheckedMap:
         try:
             if not _is_spare(files, name, rows):
                 interim.append(name)
-        except OSError as error:  # noqa: PERF203  the next one may be readable
+        except OSError as error:  # noqa: PERF203  the next file may be readable
             unreadable[name] = f"it cannot be read: {error.strerror}"
     return CheckedMap(
         path=path,
@@ -153,7 +153,7 @@ def check(files: FilesToRead, path: str) -> CheckedMap:
 
 
 def _is_spare(files: FilesToRead, name: str, rows: dict[ChunkKey, Row]) -> bool:
-    """Whether a file is only kept to be written over: its chunk's own file is as new.  Raise OSError."""
+    """Return whether a file is only a spare: its chunk's own file is as new.  Raise OSError."""
     try:
         header = read_header(files, name)
     except (FileNotFoundError, MapDataError):
@@ -191,8 +191,8 @@ def _missing(listed: dict[ChunkKey, Row], rows: dict[ChunkKey, Row], known: set[
 def repair(files: Files, found: CheckedMap) -> None:
     """Quarantine files that are damaged or cannot be read, and list the good ones in a new manifest.
 
-    ``found`` is brought up to date: everything quarantined is ``damaged`` then, with its new name.  No other
-    process may have worked with the files since they were checked.  Nothing is deleted.
+    ``found`` is updated: all quarantined files are then in ``damaged``, with their new names.  No other
+    process may have changed the files since the check.  Nothing is deleted.
 
     Raises
     ------
@@ -206,12 +206,12 @@ def repair(files: Files, found: CheckedMap) -> None:
     for one in found.damaged:
         one.kept_as = quarantine(files, one.file)
     if found.manifest != "current":
-        write_rows(files, found.rows, {})  # a program that plays scans again brings back what was damaged
+        write_rows(files, found.rows, {})  # a program that replays its scans restores the damaged chunks
         found.rewritten = True
 
 
 class ResetMap(msgspec.Struct, frozen=True):
-    """Result of a reset: how many files of how many bytes, and where they are; empty if deleted."""
+    """Result of a reset: number and bytes of the files, and where they are now; empty if deleted."""
 
     path: str
     moved_to: str
@@ -220,7 +220,7 @@ class ResetMap(msgspec.Struct, frozen=True):
 
 
 def files_of_map(files: FolderToRead) -> dict[str, int]:
-    """Return the map's own files and their bytes, in the order in which they may be removed."""
+    """Return the sizes of the map's own files, in the order in which they may be removed."""
     return {name: files.size(name) for name in FileNames.of(files.names()).of_map}
 
 
@@ -230,7 +230,7 @@ def reset(folder: Folder, *, delete: bool) -> ResetMap:
     Parameters
     ----------
     folder
-        The directory, which no other process works with.
+        The map's directory, locked by this process.
     delete
         Delete them instead of moving them.
 

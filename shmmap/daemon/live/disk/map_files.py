@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A live map on disk: what it is, its mappers, and a file for each of its chunks.
+"""A live map on disk: its settings, its mappers, and a file for each of its chunks.
 
-- ``map.json`` says what the map is, and keeps every mapper's number; it is on the disk before any of it is
-  used.
-- ``3_-1_0.chunk`` is a chunk (``shmmap/chunks/CHUNKS.md``).  It is written under another name; from then on
+- ``map.json`` holds the map's settings and every mapper's number; a change is on disk before it is used. -
+``3_-1_0.chunk`` is a chunk (``shmmap/chunks/CHUNKS.md``).  It is written under another name; from then on
   no death of a process loses it, and its memory may be freed.  `MapFiles.flush` brings it to the disk, then
   into the place of an older one, and then it is *durable*.  Until then its bytes are kept, in case the disk
   fails, and for the next load: a file that is written often is flushed seldom.
-- ``manifest.json`` lists the durable chunks.  It is written last, and only shows what was removed since; all
-  else is read from the chunks' headers.
-- A damaged file is quarantined as ``3_-1_0.chunk.damaged.1``, reported, and never overwritten.  A file that
+- ``manifest.json`` lists the durable chunks.  It is written last, and only serves to detect chunks removed
+since; all other data is read from the chunks' headers. - A damaged file is quarantined as
+``3_-1_0.chunk.damaged.1``, reported, and never overwritten.  A file that
   the system does not let this process read may be good: then the map cannot be opened, and nothing changes.
 """
 
@@ -49,7 +48,7 @@ from shmmap.logfmt import log
 __all__ = ["MapFiles"]
 
 SCANS_AHEAD: Final = 1 << 20
-"""Numbers of scans that ``map.json`` allows a mapper before it is written again: a day's, at 10 Hz."""
+"""Scan numbers that ``map.json`` reserves for a mapper at a time: those of a day at 10 Hz."""
 
 
 class MapFiles:
@@ -58,9 +57,9 @@ class MapFiles:
     Parameters
     ----------
     files
-        Of a directory that is this map's alone.
+        Files of the map's own directory.
     settings
-        Of a new map; an old one must have the same.
+        Settings of a new map; an existing map must have the same.
 
     Attributes
     ----------
@@ -69,16 +68,16 @@ class MapFiles:
     damaged : dict
         Files that were quarantined since the start, and why.
     missing : dict
-        Chunks that were durable and are gone, or left only in an older version.
+        Chunks that were durable and are gone, or exist only in an older version.
     applied : dict
-        The scan up to which all of each mapper's, by its number, are durable, as far as the manifest says.
+        For each mapper's number, the last scan up to which all are durable, according to the manifest.
 
     Raises
     ------
     ConfigError
         The map was made with other settings.
     MapDataError
-        ``map.json`` is not what it should be, or is missing although there are chunks.
+        ``map.json`` is damaged or invalid, or is missing although there are chunks.
     OSError
         A file cannot be read or written.
     """
@@ -108,25 +107,25 @@ class MapFiles:
         self._adopt_interim(names)
         self._read_rows()
 
-    # --- what the map is ------------------------------------------------------------------------
+    # --- identity and mappers ------------------------------------------------------------------------
 
     @property
     def map_id(self) -> bytes:
-        """Return 16 bytes that no other map has."""
+        """Unique id of the map, 16 bytes."""
         return bytes.fromhex(self._map.map_id)
 
     @property
     def settings(self) -> MapSettings:
-        """Return what was fixed when the map was made."""
+        """Settings that were fixed when the map was created."""
         return self._map.settings
 
     @property
     def mappers(self) -> list[Mapper]:
-        """Return all mappers, the oldest first."""
+        """All mappers, the oldest first."""
         return self._map.mappers
 
     def begin_run(self) -> int:
-        """Return how many times the map was in memory, this time included; on disk when this returns."""
+        """Return the number of runs of the map, this one included; on disk when this returns."""
         if not self._begun:
             self._map.runs += 1
             self._write_map()
@@ -134,7 +133,7 @@ class MapFiles:
         return self._map.runs
 
     def add_mapper(self, uid: int, name: str) -> Mapper:
-        """Give a new mapper its number; it is on the disk when this returns."""
+        """Add a mapper with a new number, which is on disk when this returns."""
         mapper = Mapper(self._map.next_mapper, uid, name)
         self._map.next_mapper += 1
         before, self._map.mappers = self._map.mappers, [*self._map.mappers, mapper]
@@ -146,7 +145,7 @@ class MapFiles:
         return mapper
 
     def forget_mapper(self, mapper: Mapper) -> None:
-        """Forget a mapper; no other gets its number."""
+        """Forget a mapper; its number is not used again."""
         before, self._map.mappers = self._map.mappers, [one for one in self._map.mappers if one is not mapper]
         try:
             self._write_map()
@@ -155,7 +154,7 @@ class MapFiles:
             raise
 
     def expect_scan(self, mapper: Mapper, scan: int) -> None:
-        """Note on the disk that a mapper's scans may have reached this number."""
+        """Record on disk that a mapper's scans may have reached this number."""
         if scan >= (before := mapper.scans):
             mapper.scans = scan + SCANS_AHEAD
             try:
@@ -185,19 +184,19 @@ class MapFiles:
     # --- chunks ---------------------------------------------------------------------------------
 
     def version(self, key: ChunkKey) -> int:
-        """Return the version of a chunk's file; 0 where there is none."""
+        """Return the version of a chunk's file; 0 if there is none."""
         row = self.rows.get(key)
         return row.version if row is not None else 0
 
     def load(self, key: ChunkKey) -> bytes | None:
-        """Return the file of a chunk; None where there is none.  Raise OSError, and MapDataError."""
+        """Return the content of a chunk's file; None if there is none.  Raise OSError or MapDataError."""
         if key not in self.rows:
             return None
         unflushed = self._unflushed.get(key)
         return unflushed if unflushed is not None else read_chunk(self.files, key.text + CHUNK)
 
     def quarantine(self, key: ChunkKey, why: str) -> str:
-        """Keep a file that cannot be used under another name; return that."""
+        """Rename a chunk's unusable file to a quarantine name; return that name."""
         name = self._quarantine(key.text + CHUNK, why)
         self.rows.pop(key, None)
         self._durable.pop(key, None)
@@ -219,23 +218,23 @@ class MapFiles:
         self.rows[key] = row
 
     def flush(self) -> None:
-        """Make durable what was saved; what is saved meanwhile is for the next flush."""
+        """Make all saved chunks durable; chunks saved meanwhile are left to the next flush."""
         for key, data in self._unflushed.flush().items():
             self._durable[key] = Row.of(read_file_header(data))
 
     @property
     def unflushed_bytes(self) -> int:
-        """Return how much memory the files take here that are written and not durable."""
+        """Memory of the files that are written but not durable yet, bytes."""
         return self._unflushed.nbytes
 
     def remove_spare(self) -> None:
-        """Remove files that are only kept to be written over."""
+        """Remove the spare files, which are only kept to be overwritten."""
         self._unflushed.remove_spare()
 
     def write_manifest(self, applied: dict[int, int] | None = None) -> None:
-        """Make durable what was saved, and list it.
+        """Make all saved chunks durable, and list them in the manifest.
 
-        ``applied`` is the scan up to which all of each mapper's are durable; None where it is not known.
+        ``applied`` has, for each mapper, the last scan up to which all are durable; None if unknown.
         """
         self.flush()
         if applied is not None:
@@ -245,7 +244,7 @@ class MapFiles:
     # --- the start ------------------------------------------------------------------------------
 
     def _header(self, name: str, *, whole: bool = False) -> ChunkFileHeader | None:
-        """Return the header of a file of this map, if its length is right, and, if ``whole``, its body."""
+        """Return the header of a file of this map; None if its length (``whole``: its body) is wrong."""
         with contextlib.suppress(FileNotFoundError, MapDataError):
             header = (
                 check_file(read_chunk(self.files, name), name) if whole else read_header(self.files, name)
@@ -256,7 +255,7 @@ class MapFiles:
         return None
 
     def _adopt_interim(self, names: FileNames) -> None:
-        """Give interim files that are the newest of their chunks their names, and remove the others."""
+        """Give interim files that are the newest of their chunks their final names, and remove the others."""
         for name in names.interim:
             with _named(name):
                 header = self._header(name, whole=True)
@@ -272,7 +271,7 @@ class MapFiles:
                 self.files.remove(name)
 
     def _read_rows(self) -> None:
-        """Find the chunks, and what is missing of those that the manifest lists."""
+        """Find the chunks, and those that the manifest lists but are missing."""
         names = FileNames.of(self.files.names())
         if names.strange:
             log.warning("not chunks of this map", files=len(names.strange), first=min(names.strange))
@@ -303,7 +302,7 @@ class MapFiles:
 
 @contextlib.contextmanager
 def _named(name: str) -> Iterator[None]:
-    """Name the file in the errors of the system."""
+    """Add the file's name to errors of the operating system."""
     try:
         yield
     except OSError as error:
@@ -311,6 +310,6 @@ def _named(name: str) -> Iterator[None]:
 
 
 def _flat(settings: MapSettings) -> dict[str, object]:
-    """Return all settings by name, those of the occupancy included."""
+    """Return all settings by name, including those of `occupancy`."""
     found = msgspec.structs.asdict(settings)
     return {**msgspec.structs.asdict(found.pop("occupancy")), **found}

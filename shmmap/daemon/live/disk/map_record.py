@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The files in the directory of a live map: their names, ``map.json``, ``manifest.json``, headers of chunks.
 
-All reading of the directory goes through here; ``map_files.py`` says what the files are for.  Whatever is in
-a file, reading it is bounded, and content that cannot be right is a `MapDataError`.
+All reads of the directory use this module; ``map_files.py`` explains the files' purpose.  Reading is bounded
+whatever a file contains, and invalid content raises `MapDataError`.
 """
 
 from __future__ import annotations
@@ -49,10 +49,10 @@ CHUNK: Final = ".chunk"
 """Suffix of the files of chunks."""
 
 _MAX_CHUNK_FILE_BYTES: Final = 2 * MAX_CHUNK_BYTES
-"""Length of a chunk's file: what cannot be compressed gets a little longer."""
+"""Maximum length of a chunk's file: incompressible content becomes slightly longer."""
 _MAX_MAP_BYTES: Final = 1 << 20
 _MAX_MANIFEST_BYTES: Final = MAX_BYTES - 1
-"""Length of ``map.json``, and of ``manifest.json``: about two million chunks."""
+"""Maximum length of ``map.json`` and of ``manifest.json``: about two million chunks."""
 _MAP_ID: Final = re.compile(r"[0-9a-f]{32}")
 _RESOLUTION_M: Final = (1e-4, 1e3)
 _NOT_DECODED: Final = (
@@ -64,21 +64,21 @@ _NOT_DECODED: Final = (
     OverflowError,
     struct.error,
 )
-"""What decoders raise for damaged bytes."""
+"""Exceptions that decoders raise for damaged bytes."""
 
 Count: TypeAlias = Annotated[int, msgspec.Meta(ge=0, le=(1 << 62) - 1)]
 """A number in a file that may be damaged: never negative, and small enough to add to."""
 
 
 class MapSettings(msgspec.Struct, frozen=True):
-    """What is fixed when a map is made.
+    """Settings that are fixed when a map is created.
 
     Attributes
     ----------
     resolution
         Edge of a voxel, metres.
     occupancy
-        What a hit and a miss are worth.
+        Parameters of the log-odds update: weights of hits and misses, bounds and thresholds.
     frame_id
         Frame of the map.
     """
@@ -101,9 +101,9 @@ class Mapper(msgspec.Struct):
     Attributes
     ----------
     number
-        Stands for it in chunks, and is never given to another.
+        Identifies the mapper in chunks; never used for another one.
     scans
-        All scans that it sent have smaller numbers; on the disk before one is applied.
+        Upper bound of the numbers of its scans; on disk before a scan is applied.
     """
 
     number: Annotated[int, msgspec.Meta(ge=1, le=1 << 53)]
@@ -113,7 +113,7 @@ class Mapper(msgspec.Struct):
 
 
 class Row(msgspec.Struct, frozen=True):
-    """What is known of a chunk's file without opening it."""
+    """Data about a chunk's file that is known without opening it."""
 
     version: Count
     bytes: Count
@@ -124,7 +124,7 @@ class Row(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, header: ChunkFileHeader) -> Row:
-        """Return the row of a whole file with this header."""
+        """Return the row of a complete file with this header."""
         size = FILE_HEADER_BYTES + header.stored_bytes
         return cls(header.version, size, header.active, header.occupied, header.free, header.bricks)
 
@@ -146,9 +146,9 @@ class Manifest(msgspec.Struct):
     Attributes
     ----------
     chunks
-        The durable ones.
+        The durable chunks.
     applied
-        The scan up to which all of each mapper's, by its number, are at least durable.
+        For each mapper's number, the last scan up to which at least all are durable.
     """
 
     format: int
@@ -157,16 +157,16 @@ class Manifest(msgspec.Struct):
 
 
 class FileNames(NamedTuple):
-    """The files in the directory of a live map, by what they are.
+    """The files in the directory of a live map, by kind.
 
     Attributes
     ----------
     chunks
         By key, in the order of the keys.
     strange
-        Named like files of chunks, but of chunks that cannot be.
+        Files named like chunks, but with impossible keys.
     interim
-        Files that did not get their own names yet.
+        Files still under interim names.
     quarantined
         Damaged or unreadable files that were given other names.
     """
@@ -179,7 +179,7 @@ class FileNames(NamedTuple):
 
     @classmethod
     def of(cls, names: Iterable[str]) -> FileNames:
-        """Sort names by what they mean."""
+        """Sort names by kind of file."""
         found = cls(sorted(names), {}, [], [], [])
         chunks: dict[ChunkKey, str] = {}
         for name in found.everything:
@@ -199,8 +199,8 @@ class FileNames(NamedTuple):
     def of_map(self) -> list[str]:
         """The map's own files, in the order in which they may be removed or moved.
 
-        Whatever a kill leaves is a live map still: ``map.json``, without which chunks mean nothing, goes
-        last, and the manifest, for which chunks would be missing, first.
+        If the process is killed in between, a valid live map remains.  So the manifest, which would report
+        chunks as missing, is removed first, and ``map.json``, without which chunks are meaningless, last.
         """
         own = (f".{MAP_FILE}.", f".{MANIFEST}.")
         interim = [name for name in self.interim if name.startswith(own) or f"{CHUNK}." in name]
@@ -211,7 +211,7 @@ class FileNames(NamedTuple):
 
 
 def _whole(files: FilesToRead, name: str, most: int) -> bytes:
-    """Return all of a file that is no longer than it can be; raise as `read_map`."""
+    """Return a whole file of at most ``most`` bytes; raise as `read_map`."""
     data = files.read(name, most + 1)
     if len(data) > most:
         raise MapDataError(f"it has more than {most:,} bytes", path=name, cause="too_long")
@@ -228,7 +228,7 @@ def read_header(files: FilesToRead, name: str, path: str = "") -> ChunkFileHeade
     return read_file_header(files.read(name, FILE_HEADER_BYTES), path or name)
 
 
-# made here, once: msgspec ends the process if threads are the first to decode a type at the same time
+# created once, here: msgspec crashes if several threads decode a type for the first time concurrently
 _map_record: Final = msgspec.json.Decoder(MapRecord)
 _manifest: Final = msgspec.json.Decoder(Manifest)
 
@@ -247,7 +247,7 @@ def read_map(files: FilesToRead) -> MapRecord:
     Raises
     ------
     MapDataError
-        It is not what it should be.
+        The file is damaged or invalid.
     OSError
         It cannot be read.
     """
@@ -270,14 +270,14 @@ def read_map(files: FilesToRead) -> MapRecord:
 
 
 def read_manifest(files: FilesToRead) -> tuple[dict[ChunkKey, Row], dict[int, int]]:
-    """Return the chunks that the manifest lists, and the scan up to which all of each mapper's are durable.
+    """Return the chunks in the manifest, and for each mapper the last scan up to which all are durable.
 
     Raises
     ------
     MapDataError
-        It is not what it should be.
+        The file is damaged or invalid.
     OSError
-        It cannot be read; FileNotFoundError: there is none.
+        The file cannot be read; FileNotFoundError if there is none.
     """
     found = _decoded(_whole(files, MANIFEST, _MAX_MANIFEST_BYTES), _manifest, MANIFEST)
     if found.format != MAP_FORMAT:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A live map as its files have it, read without changing anything.
+"""Read a live map from its files, without changing anything.
 
-A daemon may be working with it meanwhile: each file is replaced as a whole.
+A daemon may be using the map meanwhile: each file is replaced as a whole.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ __all__ = ["StoredMap", "opened_folder", "opened_folder_to_read"]
 
 
 class StoredMap:
-    """What a live map is, and its chunks one by one.
+    """A live map's settings, and its chunks one by one.
 
     Parameters
     ----------
     path
-        What errors call the directory.
+        Path of the directory in error messages.
 
     Attributes
     ----------
@@ -38,7 +38,7 @@ class StoredMap:
     Raises
     ------
     MapDataError
-        ``map.json`` is not what it should be.
+        ``map.json`` is damaged or invalid.
     """
 
     def __init__(self, files: FilesToRead, path: str) -> None:
@@ -67,12 +67,12 @@ class StoredMap:
             return read_header(self.files, self.chunks[key], path)
 
     def chunk(self, key: ChunkKey) -> tuple[ChunkFileHeader, ChunkView]:
-        """Read a whole chunk, and prove that it is as it was saved.
+        """Read a whole chunk and verify that it is as saved.
 
         Raises
         ------
         MapDataError
-            It is not; or it cannot be read at all (cause ``unreadable``), or was removed meanwhile (cause
+            The file is damaged, unreadable (cause ``unreadable``), or was removed meanwhile (cause
             ``missing``).
         PackageMissing
             The package for its codec is not installed.
@@ -102,14 +102,14 @@ def _reading(path: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def opened_folder_to_read(path: str) -> Iterator[FolderToRead]:
-    """Open the directory of a live map, which others may be changing.
+    """Open the directory of a live map, which other processes may be changing.
 
     Raises
     ------
     MapMissing
         There is no live map, or it cannot be opened.
     MapDataError
-        There are chunks, but no ``map.json`` that says what they are.
+        There are chunks, but no ``map.json`` that describes them.
     """
     with contextlib.closing(_opened(path)) as folder:
         yield folder
@@ -126,7 +126,7 @@ def opened_folder(path: str, hint: str) -> Iterator[Folder]:
     MapMissing, MapDataError
         As `opened_folder_to_read`.
     """
-    _opened(path).close()  # a lock on what is no live map would make a directory
+    _opened(path).close()  # checked first: locking would create a missing directory
     try:
         folder = Folder(path)
     except InstanceBusy as error:

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of chunks between being written and being on the disk: many are flushed together.
+"""Chunk files that are written but not flushed yet; many are flushed together.
 
-A file is written under an interim name.  `UnflushedFiles.flush` flushes its content, gives it its own name,
-and flushes the name, too.  Until then its bytes are kept: the kernel discards what it could not write, and
-then the file is written again.
+A file is written under an interim name.  `UnflushedFiles.flush` flushes its content, gives it its final name,
+and flushes the name, too.  Until then its bytes are kept in memory: if the kernel discards data that it could
+not write, the file is written again.
 
-A file that was replaced is not deleted but kept as a spare for the next one to write, since file systems take
-long to create a file: ext4 looks at every one that was deleted in the last seconds.  It is written over only
-when its former name is on the disk as another file's, so that it is not needed whatever happens.
+A replaced file is not deleted but kept as a spare, to be overwritten by the next file.  Creating a file is
+slow: ext4 examines every file deleted in the last seconds.  A spare is overwritten only when its former name
+is durable as another file's, so that no crash can make it needed again.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from shmmap.failpoints import step
 __all__ = ["UnflushedFiles"]
 
 _ENTRY_BYTES: Final = 1 << 10
-"""Memory of an unflushed file beside its content."""
+"""Memory of an unflushed file in addition to its content."""
 
 
 @dataclass(eq=False, slots=True)
@@ -41,12 +41,12 @@ class _Written:
 
 
 class UnflushedFiles:
-    """Unflushed files of one map; used from any thread, but for each chunk from one at a time.
+    """Unflushed files of one map.  Usable from any thread, but by one thread at a time for each chunk.
 
     Attributes
     ----------
     nbytes : int
-        Memory that they take in this process.
+        Memory of the files in this process.
     """
 
     def __init__(self, files: Files) -> None:
@@ -57,12 +57,12 @@ class UnflushedFiles:
         self._changing, self._flushing = threading.Lock(), threading.Lock()
 
     def get(self, key: ChunkKey) -> bytes | None:
-        """Return the newest file of a chunk; None where that has its own name."""
+        """Return the newest content of a chunk's file; None if the newest file has its final name."""
         written = self._written.get(key)
         return written.data if written is not None else None
 
     def write(self, key: ChunkKey, data: bytes) -> None:
-        """Write the file of a chunk; if this raises OSError, all is as it was."""
+        """Write the file of a chunk; after an OSError nothing has changed."""
         written = _Written(self._write(data), data)
         step("live.written")
         with self._changing:
@@ -73,10 +73,10 @@ class UnflushedFiles:
             if obsolete is not None and not obsolete.failed:
                 self._spare.append(obsolete.interim)
         if obsolete is not None and obsolete.failed:
-            self._remove(obsolete.interim)  # or an older file, which may have its own name on the disk
+            self._remove(obsolete.interim)  # or an older file, whose final name may be durable
 
     def _write(self, data: bytes) -> str:
-        """Write a file over a spare one, or a new one; return its name."""
+        """Write a file, over a spare one if there is any; return its name."""
         with self._changing:
             spare = self._spare.pop() if self._spare else ""
         try:
@@ -105,14 +105,14 @@ class UnflushedFiles:
             self._remove(name)
 
     def flush(self) -> dict[ChunkKey, bytes]:
-        """Make durable what was written, and return it; what is written meanwhile is for the next flush.
+        """Make the written files durable and return them; files written meanwhile are left to the next flush.
 
         Raises
         ------
         OSError
-            Some of it is not on the disk; all of it is written again by the next flush.
+            Some files are not on disk; the next flush writes all of them again.
         """
-        with self._flushing:  # a second caller waits until it is durable
+        with self._flushing:  # a second caller waits until the files are durable
             with self._changing:
                 taken = dict(self._written)
                 for one in taken.values():
@@ -149,7 +149,7 @@ class UnflushedFiles:
         self._files.sync(one.interim)
 
     def _give_name(self, interim: str, name: str) -> bool:
-        """Give a file its name; return whether the file that had it has the interim one now."""
+        """Give a file its final name; return whether the previous file has the interim name now."""
         try:
             self._files.exchange(interim, name)
         except OSError:  # there is none, or the file system cannot
@@ -158,7 +158,7 @@ class UnflushedFiles:
         return True
 
     def _note_failure(self, taken: dict[ChunkKey, _Written]) -> None:
-        """Note that a flush failed: all of it is written again, except what is replaced by now."""
+        """Record a failed flush: all its files are written again, except those replaced meanwhile."""
         with self._changing:
             for key, one in taken.items():
                 one.is_flushed, one.failed = False, True

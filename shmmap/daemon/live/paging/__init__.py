@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What of a live map is in memory: decided here, done by `shmmap.daemon.live.paged_map`."""
+"""Decide which chunks of a live map are in memory; `shmmap.daemon.live.paged_map` carries that out."""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Chunks of a live map, the scans that they take in, and which scans are safe from power cuts.
+"""Chunks of a live map, the scans applied to them, and which scans are safe from power cuts.
 
-A scan is durable when all its chunks have been written and flushed since they took it in.
+A scan is durable when all its chunks have been written and flushed after it was applied to them.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from shmmap.chunks.voxels import ChunkKey
 __all__ = ["Chunk", "Durability", "Scan", "State"]
 
 TOGETHER_S: Final = 1.0
-"""Files written within this time are flushed together: each once, however often it was written."""
+"""Files written within this time are flushed together, each once, however often it was written."""
 
 
 class State(enum.Enum):
-    """State of a chunk in memory, or of one that is being brought there."""
+    """State of a chunk that is in memory or being loaded."""
 
     LOADING = "loading"
     CLEAN = "clean"
@@ -37,13 +37,13 @@ class Scan:
     Attributes
     ----------
     mapper, number
-        Which mapper sent it, and under which number.
+        Mapper that sent the scan, and the scan's number.
     nbytes
-        Memory that it takes until it is applied.
+        Memory of the scan until it is applied.
     to_apply
-        Chunks that have not taken it in yet.
+        Chunks to which the scan is not applied yet.
     to_save
-        Chunks that have, with the version that they reached by it, and are not durable in that version.
+        Chunks to which it is applied, with the resulting version, which is not durable yet.
     """
 
     mapper: int
@@ -54,35 +54,35 @@ class Scan:
 
     @property
     def applied(self) -> bool:
-        """Whether all of it is in memory that outlives any process."""
+        """Whether the whole scan is in memory that outlives any process."""
         return not self.to_apply
 
     @property
     def durable(self) -> bool:
-        """Whether all of it is on the disk."""
+        """Whether the whole scan is on disk."""
         return not self.to_apply and not self.to_save
 
 
 @dataclass(eq=False, slots=True)
 class Chunk:
-    """A chunk in memory, or one that is to be there.
+    """A chunk that is in memory, or is to be loaded.
 
     Attributes
     ----------
     version, saved, durable
-        The version in memory, in its file, and on the disk, safe from power cuts.
+        The version in memory, in its file, and durable on disk.
     in_progress
-        It is being loaded.
+        The chunk is being loaded.
     leaving
-        It is being saved in order to be given up.
+        The chunk is being saved before its eviction.
     retry_s
-        Its file is not tried again before this time.
+        Its file is not retried before this time.
     missing_bytes
         Memory that it needs for its next scan, and did not get.
     waiting
-        Scans that it has yet to take in, in this order.
+        Scans still to be applied to it, in this order.
     unsaved
-        Scans that it has taken in and that are not durable, with its version after each.
+        Scans applied to it that are not durable, with its version after each.
     """
 
     key: ChunkKey
@@ -103,16 +103,16 @@ class Chunk:
 
 
 class Durability:
-    """Files of chunks between being written and being durable; one flush at a time.
+    """Chunk files that are written but not durable yet; one flush at a time.
 
     Attributes
     ----------
     written
         Chunks whose files were written since the last flush began, with the versions.
     flushing
-        What the running flush makes durable.
+        Chunks and versions that the running flush makes durable.
     retry_s
-        No flush before this time: one failed.
+        Time before which no flush begins, after a failed one.
     """
 
     def __init__(self) -> None:
@@ -125,17 +125,17 @@ class Durability:
 
     @property
     def due_s(self) -> float:
-        """When what was written is to be flushed; infinity for never."""
+        """Time at which the written files are to be flushed; infinity for never."""
         return max(self._first_s + TOGETHER_S, self.retry_s)
 
     def note_written(self, chunk: Chunk, version: int, now_s: float) -> None:
-        """Note that a chunk's file was written."""
+        """Record that a chunk's file was written."""
         self._first_s = min(self._first_s, now_s)
         self.written.append((chunk, version))
         self._written_keys.add(chunk.key)
 
     def note_loaded(self, chunk: Chunk) -> None:
-        """Note that a chunk came back as in its file, which may not be durable yet."""
+        """Record that a chunk was loaded from its file, which may not be durable yet."""
         if chunk.key in self._written_keys:
             self.written.append((chunk, chunk.version))
         elif chunk.key in self._flushing_keys:
@@ -145,27 +145,27 @@ class Durability:
 
     @staticmethod
     def note_applied(chunk: Chunk, scan: Scan) -> None:
-        """Note that a chunk has taken in a scan, now or before."""
+        """Record that a scan is applied to a chunk, now or before."""
         if chunk.version > chunk.durable:
             scan.to_save[chunk.key] = chunk.version
             chunk.unsaved.append((chunk.version, scan))
 
     def missing(self, chunks: Iterable[Chunk]) -> list[tuple[Chunk, int]]:
-        """Return what is not durable of these chunks, and of those given up since they were written.
+        """Return those of these chunks, and of the evicted ones, that are not durable, with their versions.
 
-        Each is durable once its ``durable`` reaches the version beside it.
+        Each is durable once its ``durable`` reaches the returned version.
         """
         in_memory = [(chunk, chunk.version) for chunk in chunks if chunk.version > chunk.durable]
         return [*in_memory, *self.written, *self.flushing]
 
     def begin(self) -> None:
-        """Begin a flush, which makes durable what was written until now."""
+        """Begin a flush of all files written until now."""
         self.flushing, self.written = self.written, []
         self._flushing_keys, self._written_keys = self._written_keys, set()
         self._first_s = math.inf
 
     def failed(self, retry_s: float) -> None:
-        """End a flush that failed; it is tried again at this time."""
+        """End a failed flush; it is retried at this time."""
         self.flushing, self.written = [], self.flushing + self.written
         self._written_keys |= self._flushing_keys
         self._flushing_keys = set()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keys of chunks in order: found by area, and iterated over a part at a time."""
+"""Sorted set of chunk keys, searched by area and iterated over in parts."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class KeyIndex:
     Parameters
     ----------
     keys
-        Its first content.
+        Initial content.
     """
 
     def __init__(self, keys: Iterable[ChunkKey] = ()) -> None:
@@ -68,21 +68,21 @@ class KeyIndex:
     def part(
         self, after: ChunkKey | None, within: KeyRange, most: int
     ) -> tuple[list[ChunkKey], ChunkKey | None]:
-        """Return the next keys of a range, and the key after which to go on.
+        """Return the next keys of a range, and the key after which to continue.
 
         Parameters
         ----------
         after
-            Keys up to this one are left out; None: from the first one on.
+            Keys up to this one are left out; None: begin with the first key.
         most
-            Keys and columns to look at, not to find.
+            Most keys and columns to examine, whether in the range or not.
 
         Returns
         -------
         keys
             Sorted.
         last
-            Pass it as ``after`` to go on; None at the end.
+            Pass it as ``after`` to continue; None at the end.
         """
         low, high = within
         found: list[ChunkKey] = []

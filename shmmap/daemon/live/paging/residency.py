@@ -1,16 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which chunks of a live map are in memory: what is loaded, applied, saved and given up, and in which order.
+"""Decide which chunks of a live map to load, change, save and evict, and in which order.
 
-Pure: clock and sizes are injected, and nothing is done here.  The owner of the memory asks what to do next
-(`next_load`, `ready`, `next_save`, `next_eviction`) and reports when it has done it.
+Pure decisions: clock and sizes are injected.  The owner of the memory asks for the next step (`next_load`,
+`ready`, `next_save`, `next_eviction`), carries it out, and reports that.
 
-- A chunk is loaded because a scan waits for it, or because it is near a client.  It stays until its room is
-  needed.  For a chunk near a client, only chunks near no client are given up; for a scan, any chunk, the
-  furthest first.
-- A scan is never dropped: it waits for chunks that are not in memory, and scans are applied in the order in
-  which they came.  What waits is bounded; beyond that scans are not accepted (`has_room`).
-- A changed chunk is saved before it is given up (once memory is half full, before its room is needed), and is
-  durable after `Limits.checkpoint_s`.  A chunk that changes while it is saved is dirty again.
+- A chunk is loaded because a scan waits for it, or because it is near a client.  It stays until its memory is
+needed.  For a chunk near a client, only chunks near no client are evicted; for a scan, any chunk, the
+furthest first. - A scan is never dropped: it waits for chunks that are not in memory, and scans are applied
+in order of arrival.  The memory of waiting scans is bounded; beyond that no scan is accepted (`has_room`). -
+A changed chunk is saved before it is evicted (once memory is half full, in advance), and is durable after
+`Limits.checkpoint_s`.  A chunk that changes while it is saved is dirty again.
 """
 
 from __future__ import annotations
@@ -32,45 +31,45 @@ from shmmap.daemon.live.paging.windows import Windows
 __all__ = ["REVIEW_S", "Limits", "Residency"]
 
 RETRY_S: Final = 1.0
-"""When a file that could not be read or written, or a chunk whose room a scan needed, is tried again."""
+"""Delay before an unreadable or unwritable file, or a chunk evicted for a scan, is tried again."""
 REVIEW_S: Final = 0.1
-"""Shortest time between two reviews of all chunks for what may be given up; 30 000 take 30 ms."""
+"""Shortest time between two reviews of all chunks for eviction; 30 000 chunks take 30 ms."""
 FRUITLESS_S: Final = 1.0
-"""The same, where the last review found nothing and no client has moved."""
+"""Shortest time after a review that found nothing, while no client moves."""
 CHUNKS_PER_CHANGE: Final = 32
-"""All chunks are also reviewed when one in this many came or changed since."""
+"""All chunks are also reviewed when one in this many was loaded or changed since."""
 SAVE_CANDIDATES: Final = 32
-"""How many of the chunks changed longest ago are searched for one that is not wanted."""
+"""How many of the chunks changed longest ago are searched for an unwanted one."""
 FOUND_PER_REVIEW: Final = 64, 16
-"""How many chunks one review finds: at least the first, or one in the second; their order gets old."""
+"""How many chunks one review selects: at least the first number, or one in the second."""
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What a map may take.
+    """Limits of one map's memory and files.
 
     Attributes
     ----------
     budget_bytes
-        Memory of all chunks and of what is beside them: lists of voxels, marks of scans.
+        Memory of all chunks, and of the lists of voxels and marks of scans beside them.
     reserve_bytes
-        Memory that chunks may take whatever is beside them: so the map can always be written.
+        Memory reserved for chunks, so that the map can always be written.
     max_chunks
-        Chunks in memory; 0 for no limit.  Each takes a descriptor and a mapping.
+        Chunks in memory; 0 for no limit.  Each uses a descriptor and a mapping.
     most_active
         Known voxels of all chunks in memory; 0 for no limit.
     waiting_bytes
         Marks of scans that wait for chunks.
     radius
-        Chunks around a client's that are kept, along each axis; 1 for its 26 neighbours.
+        Chunks kept around a client's chunk along each axis; 1 keeps its 26 neighbours.
     hysteresis
-        How far a client has to be in another chunk until its window follows, as a part of a chunk.
+        How far a client has to enter another chunk until its window follows, as a fraction of a chunk.
     linger_s
         How long a chunk outside all windows counts as near after a scan changed it.
     checkpoint_s
-        How long a change may be in memory alone.
+        How long a change may be only in memory.
     loads, saves
-        Files that are being read and written, or wait for a thread.
+        Most files being read, and being written, or waiting for a thread.
     """
 
     budget_bytes: int
@@ -87,7 +86,7 @@ class Limits:
 
 
 class _Short(enum.IntEnum):
-    """What memory is short for, and so what may be given up: nothing, chunks near no client, any chunk."""
+    """Degree of memory shortage, and so what may be evicted: nothing, chunks near no client, any chunk."""
 
     NO = 0
     NEAR = 1
@@ -95,7 +94,7 @@ class _Short(enum.IntEnum):
 
 
 class _Rank(NamedTuple):
-    """Place of a chunk in the order of giving up: the greatest goes first."""
+    """Rank of a chunk in the eviction order: the greatest is evicted first."""
 
     is_idle: bool
     is_unwanted: bool
@@ -106,7 +105,7 @@ _SAVED_TO_GO: Final = _Rank(True, True, 1 << 62)
 
 
 class _Missing:
-    """Chunks near a client that are not in memory, by their distance when they came near."""
+    """Chunks near a client that are not in memory, by their distance when they entered the window."""
 
     def __init__(self, radius: int) -> None:
         self._levels: list[dict[ChunkKey, None]] = [{} for _ in range(radius + 1)]
@@ -131,28 +130,28 @@ class _Missing:
             del self._levels[level][key]
 
     def nearest(self) -> ChunkKey:
-        """Return one of the nearest; there must be one."""
+        """Return one of the nearest chunks; the set must not be empty."""
         return next(reversed(next(level for level in self._levels if level)))
 
 
 class Residency:
-    """Decides what one map has in memory.
+    """Decides which chunks of one map are in memory.
 
     Parameters
     ----------
     limits
-        What it may take.
+        Limits of the map.
     new_bytes
-        Memory of a chunk in which nothing is known.
+        Memory of an empty chunk.
 
     Attributes
     ----------
     chunks, index
-        All chunks that are in memory, or wanted there, and their keys in order.
+        All chunks that are in memory or to be loaded, and their sorted keys.
     chunk_bytes, waiting_bytes
-        Memory of chunks, and of scans that wait.
+        Memory of chunks, and of waiting scans.
     beside_bytes, asked_bytes
-        Memory that is taken beside the chunks, and that something waits for.
+        Memory used beside the chunks, and memory that a request waits for.
     active
         Known voxels in memory.
     """
@@ -164,25 +163,25 @@ class Residency:
         self.chunk_bytes = self.waiting_bytes = self.active = 0
         self.beside_bytes = self.asked_bytes = 0
         self.loading = self.saving = 0
-        self._held = 0  # chunks that take memory
+        self._held = 0  # number of chunks that occupy memory
         self._new_bytes = new_bytes
-        self._save_after_s = max(0.0, limits.checkpoint_s - TOGETHER_S)  # the flush takes the rest
+        self._save_after_s = max(0.0, limits.checkpoint_s - TOGETHER_S)  # the rest is for the flush
         self._sizes: dict[ChunkKey, int] = {}
         self.windows = Windows(limits.radius, limits.hysteresis)
         self._missing = _Missing(limits.radius)
         self._needing: dict[ChunkKey, Chunk] = {}
-        self._dirty: dict[ChunkKey, Chunk] = {}  # changed longest ago first
-        # what to give up, the first last
+        self._dirty: dict[ChunkKey, Chunk] = {}  # the one changed longest ago first
+        # chunks to evict; the next one is at the end
         self._found: dict[State, list[tuple[_Rank, Chunk]]] = {State.CLEAN: [], State.DIRTY: []}
         self._review_s = dict.fromkeys(self._found, -math.inf)  # no review before, unless much changes
         self._fruitless_s = dict.fromkeys(self._found, -math.inf)  # nor before this, unless a client moves
         self._reviewed = dict.fromkeys(self._found, _Short.NO)
         self._changes = dict.fromkeys(self._found, 0)
-        self._save_s = self._near_s = -math.inf  # none before: a file could not be written, or loaded
+        self._save_s = self._near_s = -math.inf  # no save, or load, before this time: a file failed
         self.durability = Durability()
 
     def fits(self, more_bytes: int) -> bool:
-        """Whether this much more memory may be taken now beside the chunks."""
+        """Return whether this much more memory may be used now beside the chunks."""
         return self.chunk_bytes + self.beside_bytes + more_bytes <= self.limits.budget_bytes
 
     def _fits(self, more_bytes: int, more_chunks: int = 0) -> bool:
@@ -198,7 +197,7 @@ class Residency:
         chunk.nbytes, chunk.active = nbytes, active
 
     def _want(self, key: ChunkKey) -> Chunk:
-        """Return the chunk of this key, which is to be in memory."""
+        """Return the chunk of this key, marked as to be loaded if it is not in memory."""
         chunk = self.chunks.get(key)
         if chunk is None:
             chunk = self.chunks[key] = Chunk(key)
@@ -231,18 +230,18 @@ class Residency:
         self._fruitless_s = dict.fromkeys(self._found, -math.inf)
 
     def is_wanted(self, chunk: Chunk, now_s: float) -> bool:
-        """Whether a chunk should stay: a scan waits for it, it is near a client, or it was just changed."""
+        """Return whether a chunk should stay: a scan needs it, a client is near, or it was just changed."""
         near = chunk.key in self.windows.near
         return near or bool(chunk.waiting) or now_s < chunk.changed_s + self.limits.linger_s
 
     # --- scans ----------------------------------------------------------------------------------
 
     def has_room(self, nbytes: int) -> bool:
-        """Whether another scan is accepted: what waits is bounded, and a single one may always wait."""
+        """Return whether another scan is accepted: waiting scans are bounded, but one may always wait."""
         return not self.waiting_bytes or self.waiting_bytes + nbytes <= self.limits.waiting_bytes
 
     def add(self, scan: Scan) -> None:
-        """Add a scan: every chunk that it touches is wanted until it has taken the scan in."""
+        """Add a scan: every chunk that it touches is wanted until the scan is applied to it."""
         if scan.to_apply:
             self.waiting_bytes += scan.nbytes
         for key in scan.to_apply:
@@ -252,16 +251,16 @@ class Residency:
             self._needing[key] = chunk
 
     def ready(self) -> list[tuple[Chunk, Scan]]:
-        """Return what can be applied now: each chunk in memory with its next scan.
+        """Return the scans that can be applied now: each chunk in memory with its next scan.
 
-        Chunks that lacked the memory for it, and still do, come last.
+        Chunks that still lack the memory for their scan are at the end.
         """
         loaded = [chunk for chunk in self._needing.values() if chunk.state is not State.LOADING]
         return [(chunk, chunk.waiting[0]) for chunk in sorted(loaded, key=self._lacks_memory)]
 
     @property
     def is_ready(self) -> bool:
-        """Whether a scan can be applied now for which there may be memory."""
+        """Whether a scan can be applied now, for which there may be memory."""
         needing = self._needing.values()
         return any(one.state is not State.LOADING and not self._lacks_memory(one) for one in needing)
 
@@ -269,7 +268,7 @@ class Residency:
         return bool(chunk.missing_bytes) and not self._fits(chunk.missing_bytes)
 
     def may_grow(self, chunk: Chunk, more_bytes: int) -> bool:
-        """Whether a chunk may take this much more memory now; if not, others are given up for it."""
+        """Return whether a chunk may use this much more memory now; if not, others are evicted for it."""
         fits = self._fits(more_bytes)
         chunk.missing_bytes = 0 if fits else more_bytes
         return fits
@@ -277,7 +276,7 @@ class Residency:
     def applied(
         self, chunk: Chunk, scan: Scan, *, version: int, nbytes: int, active: int, now_s: float
     ) -> None:
-        """Note that a chunk has taken in its next scan; raise ValueError if another one comes first."""
+        """Record that a chunk's next scan is applied; raise ValueError if another scan is before it."""
         if chunk.waiting[0] is not scan:
             raise ValueError("scans of a chunk are applied in the order in which they came")
         chunk.waiting.popleft()
@@ -302,7 +301,7 @@ class Residency:
     def adopt(
         self, key: ChunkKey, *, version: int, saved: int, nbytes: int, active: int, now_s: float
     ) -> Chunk:
-        """Note a chunk that a previous writer left in memory; its file has the version ``saved``."""
+        """Add a chunk that a previous writer left in memory; its file has the version ``saved``."""
         chunk = self._want(key)
         chunk.state, chunk.version, chunk.saved, chunk.durable = State.CLEAN, version, saved, saved
         self._missing.discard(key)
@@ -312,17 +311,17 @@ class Residency:
         return chunk
 
     def note_size(self, key: ChunkKey, nbytes: int) -> None:
-        """Note how much memory a chunk on disk will take."""
+        """Record how much memory a chunk on disk will use."""
         self._sizes[key] = nbytes
 
     def _size(self, key: ChunkKey) -> int:
         return self._sizes.get(key, self._new_bytes)
 
     def next_load(self, now_s: float) -> Chunk | None:
-        """Return the chunk to load now: first those that scans wait for, then the nearest to a client."""
+        """Return the chunk to load next: one that a scan waits for, else the nearest to a client."""
         if self.loading >= self.limits.loads:
             return None
-        kept_bytes = sum(chunk.missing_bytes for chunk in self._needing.values())  # their room was made
+        kept_bytes = sum(chunk.missing_bytes for chunk in self._needing.values())  # memory was freed for them
         for chunk in self._needing.values():
             if self._can_load(chunk, now_s) and self._fits(self._size(chunk.key) + kept_bytes, 1):
                 return self._begin_load(chunk)
@@ -343,7 +342,7 @@ class Residency:
         return chunk
 
     def loaded(self, chunk: Chunk, *, version: int, nbytes: int, active: int) -> None:
-        """Note that a chunk is in memory as on disk, or new: version 0."""
+        """Record that a chunk was loaded from disk, or is new (version 0)."""
         self.loading -= 1
         chunk.in_progress = False
         chunk.state = State.CLEAN
@@ -353,7 +352,7 @@ class Residency:
         self.durability.note_loaded(chunk)
 
     def load_failed(self, chunk: Chunk, now_s: float) -> None:
-        """Note that a file could not be read: scans that wait for it go on waiting."""
+        """Record that a file could not be read: scans that need it keep waiting."""
         self.loading -= 1
         chunk.in_progress = False
         self._resize(chunk, 0, 0)
@@ -371,7 +370,7 @@ class Residency:
     # --- saving ---------------------------------------------------------------------------------
 
     def _short(self, now_s: float) -> _Short:
-        """Return what memory is short for now."""
+        """Return the present degree of memory shortage."""
         limits = self.limits
         if (
             (limits.most_active and self.active > limits.most_active)
@@ -389,13 +388,13 @@ class Residency:
         return _Short.NO
 
     def _may_go(self, chunk: Chunk, now_s: float, short: _Short) -> bool:
-        """Whether a chunk may be given up; one that can take in a scan now takes it in first."""
+        """Return whether a chunk may be evicted; a scan that can be applied to it now is applied first."""
         if chunk.state is State.LOADING or (chunk.waiting and not self._lacks_memory(chunk)):
             return False
         return short is _Short.SCANS or (short is _Short.NEAR and not self.is_wanted(chunk, now_s))
 
     def _next_victim(self, now_s: float, state: State) -> Chunk | None:
-        """Return the clean, or dirty, chunk to give up next."""
+        """Return the next clean, or dirty, chunk to evict."""
         short = self._short(now_s)
         if short is _Short.NO:
             return None
@@ -408,13 +407,13 @@ class Residency:
                 may_go = self._may_go(chunk, now_s, short)
                 if may_go and not (state is State.DIRTY and self._has_clean(rank, now_s, short)):
                     return chunk
-                if may_go or short < self._reviewed[state]:  # it goes when memory is shorter again
+                if may_go or short < self._reviewed[state]:  # evicted when memory is shorter again
                     found.append((rank, chunk))
                     return None
         return None
 
     def _has_clean(self, rank: _Rank, now_s: float, short: _Short) -> bool:
-        """Whether a clean chunk is given up before one of this rank, which then need not be saved."""
+        """Return whether a clean chunk is evicted before one of this rank, which then need not be saved."""
         found = self._found[State.CLEAN]
         return (
             bool(found)
@@ -424,12 +423,12 @@ class Residency:
         )
 
     def _note_change(self) -> None:
-        """Count a chunk that came, was changed or saved."""
+        """Count a chunk that was loaded, changed or saved."""
         for state in self._changes:
             self._changes[state] += 1
 
     def _is_review_due(self, now_s: float, state: State, short: _Short) -> bool:
-        """Whether to review all chunks again: seldom, or for a scan when much has changed."""
+        """Return whether to review all chunks again: rarely, or for a scan when much has changed."""
         if now_s >= max(self._review_s[state], self._fruitless_s[state]) or short > self._reviewed[state]:
             return True
         idle, changes = not self.loading and not self.saving, self._changes[state]
@@ -437,7 +436,7 @@ class Residency:
         return much and short is _Short.SCANS and not self._found[state]
 
     def _review(self, now_s: float, state: State, short: _Short) -> None:
-        """Find the chunks that may be given up: unwanted ones first, then the furthest."""
+        """Find the chunks that may be evicted: unwanted ones first, then the furthest."""
         self._changes[state], self._reviewed[state] = 0, short
         every = self._dirty if state is State.DIRTY else self.chunks
         found = [one for one in every.values() if one.state is state and self._may_go(one, now_s, short)]
@@ -457,7 +456,7 @@ class Residency:
         ]
 
     def next_save(self, now_s: float, *, everything: bool = False) -> Chunk | None:
-        """Return the chunk to save now: one to be given up, else one that is due, or any."""
+        """Return the chunk to save now: one to be evicted, else one that is due, or any."""
         if self.saving >= self.limits.saves or now_s < self._save_s:
             return None
         due_s = math.inf if everything else now_s - self._save_after_s
@@ -472,7 +471,7 @@ class Residency:
         return best
 
     def _next_to_leave(self, now_s: float) -> Chunk | None:
-        """Return an unwanted one once memory is half full: its room is free at once when it is needed."""
+        """Return an unwanted chunk once memory is half full: once saved, it can be evicted immediately."""
         if not self._fills_up or self._short(now_s) is not _Short.NO:
             return None
         oldest = islice(self._dirty.values(), SAVE_CANDIDATES)
@@ -483,7 +482,7 @@ class Residency:
         return 2 * (self.chunk_bytes + self.beside_bytes) > self.limits.budget_bytes
 
     def saved(self, chunk: Chunk, version: int, now_s: float) -> None:
-        """Note that a chunk's file has this version; the chunk may have changed since."""
+        """Record that a chunk's file has this version; the chunk may have changed since."""
         self.saving -= 1
         chunk.saved = version
         self._sizes[chunk.key] = chunk.nbytes
@@ -496,56 +495,56 @@ class Residency:
             self._found[State.CLEAN].append((_SAVED_TO_GO, chunk))
 
     def save_failed(self, chunk: Chunk, now_s: float) -> None:
-        """Note that a file could not be written: the chunk stays in memory, and is tried again."""
+        """Record that a file could not be written: the chunk stays in memory, and saving is retried."""
         self.saving -= 1
         chunk.retry_s = self._save_s = now_s + RETRY_S  # others would fail as well
         self._soil(chunk, now_s)
 
     @property
     def dirty(self) -> int:
-        """Chunks that are changed and neither saved nor being saved."""
+        """Number of chunks that are changed and neither saved nor being saved."""
         return len(self._dirty)
 
     @property
     def all_durable(self) -> bool:
-        """Whether no change is in memory alone."""
+        """Whether every change is durable on disk."""
         return not self._dirty and not self.saving and not self.durability.written + self.durability.flushing
 
     def flush_is_due(self, now_s: float, *, everything: bool = False) -> bool:
-        """Whether to flush the files that were written: those of some time together, or all."""
+        """Return whether to flush the written files: after some time, or with ``everything`` at once."""
         if self.durability.flushing:
             return False
         if everything and not self.saving:
             return bool(self.durability.written) and now_s >= self.durability.retry_s
         return now_s >= self.durability.due_s
 
-    # --- giving up ------------------------------------------------------------------------------
+    # --- eviction ------------------------------------------------------------------------------
 
     def next_eviction(self, now_s: float) -> Chunk | None:
-        """Return the saved chunk to give up now; its memory counts as free."""
+        """Return the saved chunk to evict now; its memory counts as free."""
         chunk = self._next_victim(now_s, State.CLEAN)
         if chunk is None:
             return None
         self._resize(chunk, 0, 0)
         self._forget(chunk.key)
-        if chunk.waiting:  # another needs its room first: it is loaded again later
+        if chunk.waiting:  # another scan needs its memory first: the chunk is loaded again later
             again = self._needing[chunk.key] = self._want(chunk.key)
             again.changed_s, again.waiting = chunk.changed_s, chunk.waiting
             chunk.waiting = deque()
         else:
             self._note_missing(chunk.key)
-            if chunk.key in self.windows.near:  # a scan needed its room, and soon would again
+            if chunk.key in self.windows.near:  # a scan needed its memory, and would soon need it again
                 self._near_s = now_s + RETRY_S
         return chunk
 
     def next_event_s(self, now_s: float) -> float:
-        """Return when something is due even if nothing happens before; infinity for never."""
+        """Return the time of the next scheduled step; infinity for never."""
         times = [chunk.retry_s for chunk in self._needing.values() if chunk.retry_s > now_s]
         if not self.durability.flushing:
             times.append(self.durability.due_s)
         if self._missing and now_s < self._near_s:
             times.append(self._near_s)
-        if self._dirty and self.saving < self.limits.saves:  # else the end of a save wakes the worker
+        if self._dirty and self.saving < self.limits.saves:  # otherwise the end of a save wakes the worker
             first = next(iter(self._dirty.values()))
             times.append(max(first.dirty_since_s + self._save_after_s, first.retry_s, self._save_s))
             if self._fills_up:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which chunks are near a client: each client has a window of chunks around it, and all windows count."""
+"""Chunks near clients: each client has a window of chunks around it, and a chunk in any window is near."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ Place: TypeAlias = tuple[float, float, float]
 
 
 def place_ahead(before: Place, here: Place, passed_s: float, ahead_s: float, longest: float) -> Place:
-    """Return where a client will be if it keeps its velocity.
+    """Return the place a client will reach at its present velocity.
 
     Parameters
     ----------
     before, here
-        Its previous place, and its place now.
+        The client's previous and present place.
     passed_s, ahead_s
-        Seconds between the two, and to look ahead.
+        Seconds between the two places, and seconds to look ahead.
     longest
-        Look-ahead along any axis at most; the direction stays the same.
+        Longest look-ahead along any axis; the direction stays the same.
     """
     moved = [now - then for now, then in zip(here, before, strict=True)]
     most = max(map(abs, moved))
@@ -43,9 +43,9 @@ class Windows:
     Parameters
     ----------
     radius
-        Chunks around a client's that are near, along each axis; 1 for its 26 neighbours.
+        Chunks around a client's chunk that are near, along each axis; 1 for its 26 neighbours.
     hysteresis
-        How far a client has to be in another chunk until its window follows, as a part of a chunk.
+        How far a client has to enter another chunk until its window follows, as a fraction of a chunk.
 
     Attributes
     ----------
@@ -60,7 +60,7 @@ class Windows:
         self.near: dict[ChunkKey, int] = {}
 
     def move(self, client: object, position: Place) -> tuple[list[ChunkKey], list[ChunkKey]]:
-        """Move a client to a position in chunks; return the chunks that came near, and that went away.
+        """Move a client to a position in chunks; return the chunks that entered and left all windows.
 
         Its window follows when the client is more than ``hysteresis`` beyond the border of the window's
         centre on each axis that changes, or at once when it is more than a chunk away.
@@ -76,7 +76,7 @@ class Windows:
         return entered, [] if center is None else self._leave(center, key)
 
     def _is_beyond(self, center: ChunkKey, position: Place) -> bool:
-        """Whether a position is far enough out of a neighbouring chunk."""
+        """Return whether a position is far enough outside the window's central chunk."""
         into = [
             max(low - value, value - low - 1.0)
             for low, value in zip(center, position, strict=True)
@@ -85,12 +85,12 @@ class Windows:
         return min(into) >= self._hysteresis
 
     def leave(self, client: object) -> list[ChunkKey]:
-        """Forget a client; return the chunks that are near none any more."""
+        """Forget a client; return the chunks that are near no client any more."""
         center = self._centers.pop(client, None)
         return [] if center is None else self._leave(center, None)
 
     def center(self, client: object) -> ChunkKey | None:
-        """Return the chunk in the middle of a client's window."""
+        """Return the central chunk of a client's window."""
         return self._centers.get(client)
 
     def _enter(self, key: ChunkKey) -> bool:
@@ -99,7 +99,7 @@ class Windows:
         return count == 1
 
     def _leave(self, center: ChunkKey, now: ChunkKey | None) -> list[ChunkKey]:
-        """Count one window less around a chunk, but not around another; return what is near none any more."""
+        """Remove a window around a chunk, except around ``now``; return chunks near no client any more."""
         left = []
         for key in self._only_around(center, now):
             self.near[key] -= 1
@@ -126,7 +126,7 @@ class Windows:
         yield from (ChunkKey(*key) for key in product(*ranges))
 
     def distances(self, keys: Sequence[ChunkKey]) -> NDArray[np.int64]:
-        """Return the distance of each chunk to the nearest client, (N,) chunks; 0 where there is none."""
+        """Return the distance of each chunk to the nearest client, (N,) chunks; 0 without clients."""
         if not self._centers or not keys:
             return np.zeros(len(keys), np.int64)
         places = np.array(keys, np.int64)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The process that keeps live maps: it alone writes chunks and their files."""
+"""The process that keeps live maps; only this process writes chunks and their files."""

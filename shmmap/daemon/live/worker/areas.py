@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Areas that readers ask for: whether they are valid, and which chunks and voxels lie in them."""
+"""Areas in readers' requests: check them, and find the chunks and voxels in them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["check_area", "inside", "key_range", "touches"]
 
 
 def check_area(area: LiveArea) -> None:
-    """Raise `BadRequest` for an area that is not valid."""
+    """Raise `BadRequest` if an area is invalid."""
     if isinstance(area, SphereMessage):
         numbers = (area.x, area.y, area.z, area.radius)
         good = all(abs(number) < FURTHEST_M for number in numbers) and area.radius >= 0.0
@@ -33,7 +33,7 @@ def check_area(area: LiveArea) -> None:
 
 
 def touches(area: LiveArea | None, key: ChunkKey, resolution: float) -> bool:
-    """Whether a chunk and an area have anything in common."""
+    """Return whether a chunk and an area intersect."""
     if area is None:
         return True
     low_x, low_y, low_z, high_x, high_y, high_z = key.box(resolution)
@@ -64,7 +64,7 @@ def inside(area: LiveArea | None, centers: NDArray[np.float64]) -> NDArray[np.bo
 
 
 def key_range(area: LiveArea | None, resolution: float) -> KeyRange:
-    """Return a range of keys that includes every chunk that touches an area, whatever rounding does."""
+    """Return a range of keys that includes every chunk that touches an area, despite rounding."""
     if area is None:
         return EVERYWHERE
     if isinstance(area, SphereMessage):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The live worker's process: reads the daemon's messages, and runs the turns of each map.
 
-It dies with the daemon, and whenever it dies the next one finds what was applied in shared memory.
+It dies with the daemon.  Whenever it dies, the next worker finds the applied scans in shared memory.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ STATUS_S: Final = 0.5
 MESSAGES_PER_TURN: Final = 16
 END_S: Final = 0.2
 HOPELESS_S: Final = 10.0
-"""At the end, after this time without a file that could be written, the rest is not saved."""
+"""At the end, saving stops after this time without a successful write."""
 OTHER_DESCRIPTORS: Final = 512
-"""Descriptors and mappings for other things than chunks."""
+"""Descriptors and mappings reserved for other purposes than chunks."""
 LEAST_CHUNKS: Final = 64
 
 
 class _Worker:
-    """Serves the maps of the daemon's first message, each when its files have been read."""
+    """Serves the maps of the daemon's first message, each as soon as its files are read."""
 
     def __init__(self, channel: socket.socket) -> None:
         self._channel = channel
@@ -69,7 +69,7 @@ class _Worker:
     # --- the start ------------------------------------------------------------------------------
 
     def begin(self, wanted: messages.Begin) -> None:
-        """Begin to bring the maps into memory; one that fails is tried again."""
+        """Begin to load the maps; a map that fails is retried."""
         self._wanted = wanted
         for one in wanted.maps:
             self._opening[one.name] = OpeningMap(one, self._budget_bytes(wanted), self._wake)
@@ -79,18 +79,18 @@ class _Worker:
         return wanted.budget_bytes // max(1, len(wanted.maps))
 
     def _open_some(self, now_s: float) -> None:
-        """Serve each map whose files have been read; report once that all are served, or why not."""
+        """Serve each map whose files are read; report once when all are served, or why they are not."""
         for name, one in list(self._opening.items()):
             found = one.run_turn(now_s)
             if found is not None:
                 try:
                     self._maps[name] = self._served(one.settings, *found)
                     del self._opening[name]
-                except Exception as error:  # noqa: BLE001  one map's damaged memory ends no other map
+                except Exception as error:  # noqa: BLE001  one map's damaged memory must not end other maps
                     one.failed(error, now_s)
         if not self._begun and all(one.problem for one in self._opening.values()):
             self._begun = True
-            self._send_status(now_s)  # before READY, so that the maps' state can be read then
+            self._send_status(now_s)  # before READY, so that the maps' state is available by then
             self._send(messages.Begun(len(self._maps), self._chunks, *self._refusal()))
 
     @property
@@ -98,7 +98,7 @@ class _Worker:
         return sum(len(one.live.chunks) for one in self._maps.values())
 
     def _refusal(self) -> tuple[str, str, str]:
-        """Return why no map can be served until the settings change; empty if that may pass by itself."""
+        """Return why no map can be served with these settings; empty if the problem may be temporary."""
         errors = [one.error for one in self._opening.values()]
         refused = [one for one in errors if isinstance(one, ConfigError | InstanceBusy)]
         if self._maps or len(refused) < len(errors) or not refused:
@@ -106,7 +106,7 @@ class _Worker:
         return refused[0].code, refused[0].message, refused[0].hint
 
     def _served(self, settings: LiveSettings, folder: Folder, files: MapFiles) -> ServedMap:
-        """Bring a map into memory: what an earlier process left there, and room for more."""
+        """Set up a map in memory, including chunks that a previous process left there."""
         wanted = self._wanted
         assert wanted is not None  # noqa: S101
         mode = 0o640 if wanted.gid >= 0 else 0o600
@@ -142,7 +142,7 @@ class _Worker:
     # --- turns ----------------------------------------------------------------------------------
 
     def run(self) -> None:
-        """Serve until the daemon sends `End`, or is gone."""
+        """Serve until the daemon sends `End` or is gone."""
         while self.run_turn():
             pass
         if self._ending is not None:
@@ -150,12 +150,12 @@ class _Worker:
                 self._send(messages.Ended(self.end(self._ending)))
 
     def run_turn(self) -> bool:
-        """Wait until something is due, and do it; return whether there is a next turn."""
+        """Wait until work is due, and do it; return whether there is a next turn."""
         for fd, _ in self._poller.poll(self._poll_timeout_ms(time.monotonic())):
             if fd == self._done:
                 os.eventfd_read(self._done)
             elif not self._receive():
-                self._ending = None  # the daemon is gone: what is in memory stays there
+                self._ending = None  # the daemon is gone: chunks stay in memory
                 return False
         now_s = time.monotonic()
         ending = self._ending is not None
@@ -174,10 +174,10 @@ class _Worker:
         return max(0.0, min(due_s - now_s, STATUS_S if self._ending is None else END_S)) * 1000
 
     def _receive(self) -> bool:
-        """Take in messages of the daemon; return False when it is gone."""
+        """Handle messages from the daemon; return False when it is gone."""
         try:
             for _ in range(MESSAGES_PER_TURN):
-                # answers wait until the daemon takes them: the channel itself is not made non-blocking
+                # answers block until the daemon reads them: the channel itself is not non-blocking
                 data, _fd = receive_packet(self._channel, self._buffer, wait=False)
                 if not data:
                     return False
@@ -208,7 +208,7 @@ class _Worker:
                 raise BadRequest("this is no request about live maps")
         except ShmmapError as error:
             self._answer(ask.ticket, ErrorReply(request, error.code, error.message, error.hint))
-        except Exception:  # noqa: BLE001  a defect met by one request must not end all others
+        except Exception:  # noqa: BLE001  a defect in one request must not end all others
             log.exception("request about a live map failed")
             failed = InternalError("the daemon failed on this request")
             self._answer(ask.ticket, ErrorReply(request, failed.code, failed.message, failed.hint))
@@ -252,12 +252,12 @@ class _Worker:
     # --- the end --------------------------------------------------------------------------------
 
     def _may_end(self, ending: messages.End, now_s: float) -> bool:
-        """Whether all is saved, or nothing more can be: for a while no file of the rest was written."""
+        """Return whether all is saved, or saving has made no progress for a while."""
         left = [one for one in self._maps.values() if not one.is_saved]
         return ending.keep or all(now_s > max(one.live.saved_s, self._ending_s) + HOPELESS_S for one in left)
 
     def end(self, ending: messages.End) -> tuple[messages.Unsaved, ...]:
-        """Leave memory as it is, or empty it; return what stays because it is nowhere else."""
+        """Close all maps, keeping or freeing their memory; return the unsaved chunks, which stay."""
         unsaved = []
         for name, one in self._maps.items():
             if chunks := one.end(keep=ending.keep):
@@ -270,7 +270,7 @@ class _Worker:
 
 
 def _limits(settings: LiveSettings, budget_bytes: int, maps: int) -> Limits:
-    """Return the limits of one of this many maps; what is beside its chunks leaves them a quarter."""
+    """Return the limits of one of ``maps`` maps; a quarter of its memory is reserved for chunks."""
     limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
     with contextlib.suppress(OSError, ValueError):
         limit = min(limit, int(Path("/proc/sys/vm/max_map_count").read_text()))
@@ -292,7 +292,7 @@ def main(arguments: list[str]) -> int:
     with channel_to_parent(arguments) as channel, contextlib.suppress(ConnectionError):
         data, _ = receive_packet(channel, packet_buffer())
         if not data:
-            return 0  # the daemon did not start after all
+            return 0  # the daemon gave up its start
         wanted = messages.decode_to_live(data)
         if not isinstance(wanted, messages.Begin):
             return 1
@@ -301,7 +301,7 @@ def main(arguments: list[str]) -> int:
         gc.collect()
         gc.freeze()
         worker.run()
-    os._exit(0)  # a thread may wait for a directory that hangs
+    os._exit(0)  # a thread may be blocked by a directory that hangs
 
 
 if __name__ == "__main__":

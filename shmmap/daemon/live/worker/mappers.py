@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mappers of a live map, and how far their scans have come: each is applied once, however often it is sent.
+"""Mappers of a live map and the progress of their scans: each scan is applied once, however often it is sent.
 
-A mapper is a user and a name that one of the user's programs chose; its scans have numbers that rise, also
-when the program is restarted.  A scan that was sent twice is applied once: until it is applied, both requests
-wait for it; afterwards every chunk knows that it has it.
+A mapper is a user and a name that one of the user's programs chose.  Its scans have increasing numbers, also
+across restarts of the program.  A scan that is sent twice is applied once: until it is applied, both requests
+wait for it; afterwards every chunk remembers it.
 """
 
 from __future__ import annotations
@@ -24,40 +24,40 @@ from shmmap.errors import BadRequest, Busy, LiveInterrupted
 __all__ = ["APPLIED_BYTES", "ActiveMapper", "AppliedScans", "Mappers"]
 
 MAX_SCANS: Final = 1 << 61
-"""Numbers of scans are less: what ``map.json`` expects beyond them has to be a number, too."""
+"""Bound of scan numbers: numbers that ``map.json`` reserves beyond them must be valid, too."""
 _ROW: Final = np.dtype([("mapper", "<u8"), ("scan", "<u8")])
 APPLIED_BYTES: Final = _ROW.itemsize * MAPPERS
 
 
 class AppliedScans:
-    """The scan up to which all of each mapper's are in memory that outlives the worker.
+    """For each mapper, the last scan up to which all are in memory that outlives the worker.
 
-    A program that plays scans from files goes on after this one.  The number is never greater than what is in
-    the map; a scan that is sent again does not count twice.
+    A program that replays scans from files continues after this scan.  The number is never greater than that
+    of the scans in the map; a scan that is sent again does not count twice.
 
     Parameters
     ----------
     memory
-        `APPLIED_BYTES`, at first zeros.
+        `APPLIED_BYTES` bytes, initially zeros.
     """
 
     def __init__(self, memory: bytearray | mmap.mmap) -> None:
         self._rows = np.frombuffer(memory, _ROW, MAPPERS)
 
     def of(self, mapper: int) -> int:
-        """Return the scan up to which all are in the map; 0 where nothing is known."""
+        """Return the scan up to which all are in the map; 0 if unknown."""
         found = np.flatnonzero(self._rows["mapper"] == mapper)
         return int(self._rows["scan"][found[0]]) if len(found) else 0
 
     def note(self, mapper: int, scan: int, known: Collection[int]) -> None:
-        """Note that all scans of a mapper up to this one are in the map; replace mappers not ``known``."""
+        """Record that all scans of a mapper up to this one are in the map; replace mappers not ``known``."""
         found = np.flatnonzero(self._rows["mapper"] == mapper)
         if not len(found):
             numbers = self._rows["mapper"].tolist()
             at = next((at for at, number in enumerate(numbers) if number not in known), None)
             if at is None:
-                return  # nothing is lost: only the scan to go on from is unknown
-            self._rows["scan"][at] = 0  # a kill between these must not leave another mapper's number
+                return  # no scan is lost: only the scan to continue from is unknown
+            self._rows["scan"][at] = 0  # a kill between these steps must not leave another mapper's number
             self._rows["mapper"][at] = mapper
             found = np.array([at])
         self._rows["scan"][found[0]] = scan
@@ -70,15 +70,15 @@ class ActiveMapper:
     Attributes
     ----------
     first
-        The least number that no scan had in previous runs.
+        The lowest number that no scan had in previous runs.
     session
-        The session that maps under it now; 0 for none.
+        The session that uses the mapper now; 0 for none.
     last
-        Highest number of a scan that was accepted; at first, that is known to be in the map.
+        Highest number of an accepted scan; initially, of a scan known to be in the map.
     used
-        Order of use: the greatest was used last.
+        Order of use: the mapper with the greatest value was used last.
     unapplied, unsaved
-        Accepted scans that are not applied, and not durable.
+        Accepted scans that are not applied yet, and that are not durable yet.
     """
 
     mapper: Mapper
@@ -91,12 +91,12 @@ class ActiveMapper:
 
     @property
     def applied(self) -> int:
-        """All scans up to this one are in the map."""
+        """Number of the scan up to which all are in the map."""
         return min(self.unapplied) - 1 if self.unapplied else self.last
 
     @property
     def durable(self) -> int:
-        """All scans up to this one are on the disk."""
+        """Number of the scan up to which all are on disk."""
         return min(self.unsaved) - 1 if self.unsaved else self.last
 
 
@@ -114,14 +114,14 @@ class Mappers:
             self.by_number[one.number] = ActiveMapper(one, one.scans + 1, last=last)
 
     def open(self, uid: int, name: str, session: int) -> ActiveMapper:
-        """Give a mapper's name to a session, and take it from any other session.  Called from any thread.
+        """Assign a mapper to a session, taking it from any other session.  Called from any thread.
 
         Raises
         ------
         Busy
-            There are as many mappers as a chunk remembers, and none of them can be forgotten.
+            There are as many mappers as a chunk can remember, and none can be forgotten.
         OSError
-            A new one cannot be written to the disk.
+            A new mapper cannot be written to disk.
         """
         with self._opening:
             for active in self.by_number.values():
@@ -133,7 +133,7 @@ class Mappers:
                 mapper = self._files.add_mapper(uid, name)
                 active = ActiveMapper(mapper)
                 self.by_number = {**self.by_number, mapper.number: active}  # another thread may iterate
-            # now, and not with the first scan: once opened, a mapper also maps on a disk that is full
+            # now, not with the first scan: once opened, a mapper works even when the disk is full
             self._files.expect_scan(active.mapper, self.next_scan(active))
             active.session = session
             self._uses += 1
@@ -152,36 +152,36 @@ class Mappers:
         self.by_number = {number: one for number, one in self.by_number.items() if one is not oldest}
 
     def accepted(self, active: ActiveMapper, scan: int) -> None:
-        """Note that a scan was accepted; it may have come before."""
+        """Record that a scan was accepted, possibly again."""
         active.unapplied.add(scan)
         active.unsaved.add(scan)
         active.last = max(active.last, scan)
 
     def applied(self, active: ActiveMapper, scan: int) -> None:
-        """Note that a scan is in the map."""
+        """Record that a scan is in the map."""
         active.unapplied.discard(scan)
         self._record.note(active.mapper.number, active.applied, self.by_number)
 
     def next_scan(self, active: ActiveMapper) -> int:
-        """Return the least number for a new scan: no scan of any run had it."""
+        """Return the lowest number for a new scan, which no scan of any run had."""
         return max(active.last + 1, active.first)
 
     def is_far(self, number: int, scan: int) -> bool:
-        """Whether a scan's number has to be noted on the disk first."""
+        """Return whether a scan's number has to be recorded on disk first."""
         active = self.by_number.get(number)
         return active is not None and active.mapper.scans <= scan < MAX_SCANS
 
     def expect(self, number: int, scan: int, session: int) -> ActiveMapper:
-        """Return the mapper of a scan that is about to be accepted; wait for the disk if `is_far`.
+        """Return the mapper of a scan about to be accepted; wait for the disk if `is_far`.
 
         Raises
         ------
         BadRequest
-            The session does not map under this number.
+            The session does not use this mapper.
         LiveInterrupted
-            No session does, since the worker was restarted.
+            No session uses it, since the worker was restarted.
         OSError
-            The number cannot be written to the disk first.
+            The number cannot be written to disk.
         """
         active = self.by_number.get(number)
         if active is None:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The directory where mappers put the marks of their scans, as files; their content is not trusted.
+"""The directory where mappers put files with the marks of their scans; the content is not trusted.
 
 The directory belongs to the daemon; members of the mappers' group may create files in it and remove their own
-(mode 1770).  A file is named after the session that made it, and removed when that has ended.
+(mode 1770).  A file is named after the session that created it, and removed when that session has ended.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from shmmap.errors import BadRequest
 __all__ = ["MAX_MARKS_BYTES", "MarksDirectory"]
 
 MAX_MARKS_BYTES: Final = 32 << 20
-"""Length of one scan's marks; 120 000 points make 0.2 MB."""
+"""Maximum length of one scan's marks; 120 000 points make 0.2 MB."""
 
 _NAME: Final = re.compile(r"([0-9a-f]{1,16})\.[0-9]{1,20}")
 
@@ -29,14 +29,14 @@ class MarksDirectory:
     Parameters
     ----------
     path
-        On a tmpfs; created here, and what a previous run left in it is removed.
+        Path on a tmpfs.  The directory is created, and files of a previous run are removed.
     gid
-        Group whose members may map; -1: none, only the owner.
+        Group whose members may map; -1: only the owner may.
 
     Raises
     ------
     OSError
-        It cannot be created, or belongs to another user.
+        The directory cannot be created, or belongs to another user.
     """
 
     def __init__(self, path: str, gid: int = -1) -> None:
@@ -56,19 +56,19 @@ class MarksDirectory:
             raise
 
     def take(self, name: str, nbytes: int, session: int, uid: int) -> bytes:
-        """Return the content of a file of marks, and remove the file: its memory is free for chunks.
+        """Return the content of a file of marks, and remove the file to free its memory for chunks.
 
         Parameters
         ----------
         name, nbytes
             As in the mapper's request.
         session, uid
-            Its owner.
+            Session and user that must own the file.
 
         Raises
         ------
         BadRequest
-            It cannot be a file of marks of this session: the message says why.
+            It is not a valid file of marks of this session; the message contains the reason.
         """
         found = _NAME.fullmatch(name)
         if found is None or found[1] != f"{session:x}":

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A live map whose files are being read: in a thread, since a directory may hang, until it succeeds.
+"""Open a live map: a thread reads its files, since a directory may hang, and retries on errors.
 
-A problem with one map's files is that map's alone: it is reported, and other maps are served meanwhile.
+A problem with one map's files is reported, and does not affect other maps.
 """
 
 from __future__ import annotations
@@ -22,27 +22,27 @@ from shmmap.protocol.live import LiveMapRow
 __all__ = ["OpeningMap"]
 
 LONG_S: Final = 1.0
-"""Reading that takes longer than this is a problem; with a slow disk it passes by itself."""
+"""Reading time that is reported as a problem; on a slow disk it ends by itself."""
 RETRY_S: Final = 1.0
-"""Least pause after the files could not be read."""
+"""Shortest pause after a failed try."""
 PAUSE_FACTOR: Final = 4.0
-"""How much longer than the failed try the pause is: large maps are not read all the time."""
+"""Ratio of the pause to the duration of the failed try, so that large maps are not read continuously."""
 
 
 class OpeningMap:
-    """One map that is being brought into memory.
+    """One map that is being opened.
 
     Parameters
     ----------
     wake
-        Called in the thread when the files have been read, or cannot be.
+        Called in the thread when reading the files has succeeded or failed.
 
     Attributes
     ----------
     problem
-        Why it is not open; empty while that is not known.
+        Why the map is not open; empty while the reason is not known.
     error
-        Of the last try.
+        Error of the last try.
     """
 
     def __init__(self, settings: LiveSettings, budget_bytes: int, wake: Callable[[], None]) -> None:
@@ -56,7 +56,7 @@ class OpeningMap:
         self._outcome: list[tuple[Folder, MapFiles] | Exception] = []
 
     def run_turn(self, now_s: float) -> tuple[Folder, MapFiles] | None:
-        """Continue; return the open directory and its files, in a new run, once they have been read."""
+        """Continue; once the files are read, begin a new run and return the open directory and the files."""
         if self._thread is None:
             if now_s >= self._retry_s:
                 self._begun_s = now_s
@@ -76,7 +76,7 @@ class OpeningMap:
         return None
 
     def failed(self, error: Exception, now_s: float) -> None:
-        """Note that it cannot be opened: that is its problem until the next try succeeds."""
+        """Record an error of opening as the map's problem until a try succeeds."""
         self.error = error
         self._retry_s = now_s + max(RETRY_S, PAUSE_FACTOR * (now_s - self._begun_s))
         self._note(f"it cannot be opened: {_reason(error)}")
@@ -93,7 +93,7 @@ class OpeningMap:
         return max(now_s, self._begun_s + LONG_S) if not self.problem else now_s + LONG_S
 
     def status(self) -> LiveMapRow:
-        """Return the map's state: nothing of it is in memory."""
+        """Return the map's state, with no chunk in memory."""
         return not_served(self.settings, self._budget_bytes, self.problem)
 
     def _read(self) -> None:
@@ -101,7 +101,7 @@ class OpeningMap:
         outcome: tuple[Folder, MapFiles] | Exception
         try:
             outcome = open_files(self.settings)
-        except Exception as error:  # noqa: BLE001  a damaged file must not end another map
+        except Exception as error:  # noqa: BLE001  a damaged file must not end other maps
             outcome = error
         self._outcome.append(outcome)
         self._wake()

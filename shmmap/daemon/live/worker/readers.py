@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Requests of readers of a live map: which chunks there are, what changed, which voxels lie in an area.
+"""Requests of readers of a live map: lists of chunks, of changes, and of voxels in an area.
 
-A request is processed in steps, each much shorter than a scan takes.  Sessions take turns of one step, in a
-small part of the time between two scans; files are read in threads of their own.  So readers wait for each
-other and for the disk, and mapping waits for none of them.
+A request is processed in steps, each much shorter than the work for a scan.  Sessions alternate step by step,
+in a small part of the time between two scans; separate threads read files.  So readers wait for each other
+and for the disk, and mapping waits for none of them.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ from shmmap.protocol.messages import ErrorReply
 __all__ = ["Readers"]
 
 NOTHING: Final = Row(0, 0, 0, 0, 0, 0)
-"""Row of a chunk that has no file."""
+"""Row of a chunk without a file."""
 TURN_S: Final = 0.001
-"""Longest time, seconds, that readers get between two turns of the worker if other work waits."""
+"""Longest time for readers between two turns of the worker while other work waits, seconds."""
 KEYS_PER_STEP: Final = 64
 FEW_CHANGES: Final = 1000
-"""More chunks than this are not sorted in one step."""
+"""Most chunks that are sorted in one step."""
 THREADS: Final = 2
-"""They read the files that readers ask for; mapping has its own."""
+"""Threads that read files for readers; mapping has its own threads."""
 MEASURED_S: Final = 2.0
 BUSIEST: Final = 3
-"""Sessions that are reported for the time that they take."""
+"""How many of the sessions that use the most time are reported."""
 MAX_GONE: Final = 4000
-"""Chunks that left memory and are remembered: all of them go into one reply."""
+"""How many chunks that left memory are remembered; all of them fit into one reply."""
 
 
 class Changes:
@@ -55,27 +55,27 @@ class Changes:
     Parameters
     ----------
     first
-        Number to begin with: greater than any of a previous run.
+        First number, greater than any of a previous run.
 
     Attributes
     ----------
     number
-        Of the last change.
+        Number of the last change.
     """
 
     def __init__(self, first: int) -> None:
         self.number = self._forgotten = first
-        self._changed: dict[ChunkKey, int] = {}  # the last one last
+        self._changed: dict[ChunkKey, int] = {}  # most recently changed at the end
         self._gone: deque[tuple[int, ChunkKey]] = deque()
 
     def note_changed(self, key: ChunkKey) -> None:
-        """Note that a chunk came into memory, or was changed there."""
+        """Record that a chunk was loaded into memory, or changed there."""
         self.number += 1
         self._changed.pop(key, None)
         self._changed[key] = self.number
 
     def note_gone(self, key: ChunkKey) -> None:
-        """Note that a chunk left memory."""
+        """Record that a chunk left memory."""
         self.number += 1
         self._changed.pop(key, None)
         self._gone.append((self.number, key))
@@ -83,15 +83,15 @@ class Changes:
             self._forgotten, _ = self._gone.popleft()
 
     def known(self, since: int) -> bool:
-        """Whether all changes after ``since`` are remembered."""
+        """Return whether all changes after ``since`` are remembered."""
         return self._forgotten <= since <= self.number
 
     def is_newer(self, key: ChunkKey, since: int) -> bool:
-        """Whether a chunk in memory changed after ``since``."""
+        """Return whether a chunk in memory changed after ``since``."""
         return self._changed.get(key, 0) > since
 
     def newer(self, since: int, most: int) -> list[ChunkKey] | None:
-        """Return the chunks in memory that changed after ``since``; None if they are more than ``most``."""
+        """Return the chunks in memory that changed after ``since``; None if there are more than ``most``."""
         found: list[ChunkKey] = []
         for key, number in reversed(self._changed.items()):
             if number <= since:
@@ -102,7 +102,7 @@ class Changes:
         return found
 
     def gone(self, since: int) -> list[ChunkKey]:
-        """Return the chunks that left memory after ``since`` and did not come back."""
+        """Return the chunks that left memory after ``since`` and were not loaded again."""
         newest_first = list(takewhile(lambda one: one[0] > since, reversed(self._gone)))
         keys = dict.fromkeys(key for _, key in reversed(newest_first))
         return [key for key in keys if key not in self._changed]
@@ -110,7 +110,7 @@ class Changes:
 
 @dataclass(eq=False, slots=True)
 class _Work:
-    """A request in progress; ``error`` or ``outcome`` is of the last thing that a thread did for it."""
+    """A request in progress; ``error`` or ``outcome`` is the result of its last work in a thread."""
 
     ask: Ask
     request: int
@@ -126,18 +126,18 @@ class Readers:
     Parameters
     ----------
     live, changes
-        The map, and what changed in it.
+        The map, and its numbered changes.
     answer
-        Takes a ticket and the reply to it.
+        Sends a reply, given the request's ticket.
     wake
-        Called, in another thread, when there is something to do in the next turn.
+        Called in another thread when there is work for the next turn.
 
     Attributes
     ----------
     lists
         Lists of the map's voxels.
     busiest
-        Sessions whose requests took most of the time, and how much of one processor, in thousandths.
+        Sessions whose requests used most of the time, with their share of one processor, thousandths.
     """
 
     def __init__(
@@ -158,7 +158,7 @@ class Readers:
         self.busiest: tuple[tuple[int, int], ...] = ()
 
     def next_turn_s(self, now_s: float) -> float:
-        """Return when something is due; infinity for never."""
+        """Return the time at which the next turn is due; infinity for never."""
         if self._ready:
             return now_s
         return min([self.lists.next_expiry_s, *(due_s for due_s, _ in self._later)])
@@ -179,12 +179,12 @@ class Readers:
         self.lists.on_disconnect(session)
 
     def close(self) -> None:
-        """Answer nothing more: the end does not wait for files that readers asked for."""
+        """Stop answering: the end does not wait for files requested by readers."""
         self.lists.is_closed = True
         self._threads.close(0.0)
 
     def begin(self, ask: Ask, message: messages.LiveChunks | messages.LiveVoxels) -> None:
-        """Begin a request, which is answered in later turns; raise `BadRequest`."""
+        """Begin a request, which is answered in later turns; raise `BadRequest` if it is invalid."""
         if message.area is not None:
             check_area(message.area)
         if isinstance(message, messages.LiveChunks):
@@ -222,7 +222,7 @@ class Readers:
             before_s = after_s
 
     def measure(self, now_s: float) -> None:
-        """Find the busiest sessions, from time to time."""
+        """Update the list of the busiest sessions at intervals."""
         passed_s = now_s - self._measured_s
         if passed_s >= MEASURED_S:
             busiest = sorted(self._spent_s.items(), key=lambda item: -item[1])[:BUSIEST]
@@ -245,7 +245,7 @@ class Readers:
             self._refuse(work, failed)
         except OSError as failed:
             self._refuse(work, CannotWrite(f"the list of voxels: {failed.strerror}"))
-        except Exception:  # noqa: BLE001  a defect met by one request must not end the map for all
+        except Exception:  # noqa: BLE001  a defect in one request must not end the map for all
             log.exception("request of a reader failed")
             self._refuse(work, InternalError("the daemon failed on this request"))
         else:
@@ -262,7 +262,7 @@ class Readers:
         self._answer(work.ask.ticket, reply)
 
     def _read(self, work: _Work, what: Callable[[], Any]) -> None:
-        """Do something for a request in a thread, after what others of the same session wait for."""
+        """Call a function for a request in a thread, after earlier work of the same session."""
         waiting = self._in_thread.setdefault(work.ask.session, deque())
         waiting.append((work, what))
         if len(waiting) == 1:
@@ -288,7 +288,7 @@ class Readers:
     def _keys(
         self, area: LiveArea | None, indexes: list[KeyIndex], since: int, after: ChunkKey | None
     ) -> Iterator[list[ChunkKey]]:
-        """Yield chunks that touch an area, in order, a step's at a time; of those in memory what changed."""
+        """Yield chunks that touch an area, in order, one list per step; chunks in memory only if changed."""
         resolution = self.live.resolution
         few = (
             self.changes.newer(since, FEW_CHANGES)

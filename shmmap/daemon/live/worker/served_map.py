@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One live map as its clients use it: requests come in, and are answered when they have been fulfilled."""
+"""One live map as its clients use it: requests are accepted, and answered when they are fulfilled."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ __all__ = ["ServedMap"]
 _T = TypeVar("_T")
 
 AHEAD_S: Final = 2.0
-"""Look-ahead: chunks are loaded for where a client will be then if it keeps its velocity."""
+"""Look-ahead: chunks are loaded around the place that a client will have reached after this time."""
 MAX_AHEAD_CHUNKS: Final = 4.0
 MARKS_PART: Final = 2
-"""Marks of one scan may take this part of the budget: they are in shared memory until they are accepted."""
+"""Divisor of the budget for the marks of one scan, which are in shared memory until they are accepted."""
 MANIFEST_S: Final = 60.0
 FILES_S: Final = 0.5
-"""How often the sizes of files are added up."""
+"""Interval at which the sizes of files are summed."""
 
 
 class _Reply(Protocol):
@@ -53,25 +53,25 @@ class _Reply(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class _Place:
-    """Where a session was, and when."""
+    """Place of a session, and the time at which it was there."""
 
     xyz: tuple[float, float, float]
     seen_s: float
 
 
 class ServedMap:
-    """Answers the requests about one map, and observes what happens in it.
+    """Answers the requests about one map, and observes its changes.
 
     Parameters
     ----------
     files, memory, limits
-        Of the map; `adopt` takes over what a previous run left in memory.
+        The map's files, memory and limits; `adopt` takes over the chunks that a previous run left in memory.
     marks
-        Where mappers put marks.
+        Directory where mappers put marks.
     answer
-        Takes a ticket and the reply to it.
+        Sends a reply, given the request's ticket.
     wake
-        Called, in another thread, when there is something to do in the next turn.
+        Called in another thread when there is work for the next turn.
     codec
         How chunks are compressed on disk.
     """
@@ -94,14 +94,14 @@ class ServedMap:
         self.readers = Readers(self.live, self.changes, answer, wake)
         self._marks = marks
         self._answer = answer
-        self._tickets: dict[tuple[int, int], list[tuple[int, int]]] = {}  # of scans that are not applied yet
+        self._tickets: dict[tuple[int, int], list[tuple[int, int]]] = {}  # of scans not applied yet
         self._waiting: deque[tuple[Ask, messages.LiveScan]] = deque()
         self._saves: list[tuple[Ask, messages.LiveSave, list[tuple[Chunk, int]]]] = []
         self._places: dict[int, _Place] = {}
         self._writing: dict[int, int] = {}  # sessions by ticket whose requests wait for the disk
-        self._adopted: list[tuple[Chunk, int]] = []  # what a previous run applied, and is not durable yet
+        self._adopted: list[tuple[Chunk, int]] = []  # applied by a previous run, not durable yet
         self._scans = self._durable = 0
-        self._marks_bytes = 0  # of those in shared memory, as it was counted last
+        self._marks_bytes = 0  # size of marks in shared memory when last counted
         self._file_bytes, self._files_s = 0, -math.inf
         self._manifest_s = 0.0
         self._listed = -1
@@ -174,13 +174,13 @@ class ServedMap:
         self._on_disk(ask, message.request, open_mapper, opened)
 
     def _on_disk(self, ask: Ask, request: int, work: Callable[[], _T], then: Callable[[_T], None]) -> None:
-        """Write something first, in a file thread since the directory may hang; answer if that fails."""
+        """Write to disk first, in a file thread since the directory may hang; answer if that fails."""
         self._writing[ask.ticket] = ask.session
 
         def written(future: Future[_T], now_s: float) -> None:
             del now_s
             if self._writing.pop(ask.ticket, None) is None:
-                self.mappers.on_disconnect(ask.session)  # it has ended meanwhile
+                self.mappers.on_disconnect(ask.session)  # the session has ended meanwhile
                 return
             try:
                 then(future.result())
@@ -209,17 +209,17 @@ class ServedMap:
     @staticmethod
     def _add_ticket(tickets: list[tuple[int, int]], ask: Ask, message: messages.LiveScan) -> None:
         tickets.append((ask.ticket, message.request))
-        del tickets[:-MAX_PER_SESSION]  # older ones are of sessions that have ended
+        del tickets[:-MAX_PER_SESSION]  # older tickets belong to sessions that have ended
 
     def _accept_scans(self) -> None:
-        """Accept scans that wait, as long as there is room; others stay where the mappers put them."""
+        """Accept waiting scans while there is memory; the others stay in the directory of marks."""
         while self._waiting and self.live.residency.has_room(self._waiting[0][1].bytes):
             ask, message = self._waiting.popleft()
             try:
                 self._accept(ask, message)
             except ShmmapError as error:
                 self._refuse(ask, message.request, error)
-            except Exception:  # noqa: BLE001  a defect met by one file must not end the map for all
+            except Exception:  # noqa: BLE001  a defect with one file must not end the map for all
                 log.exception("marks cannot be read")
                 self._refuse(ask, message.request, InternalError("the daemon failed on these marks"))
 
@@ -238,7 +238,7 @@ class ServedMap:
         self.live.add(message.mapper, message.scan, marks, message.bytes)
 
     def _move(self, session: int, position: tuple[float, float, float], now_s: float) -> None:
-        """Move a client: chunks near its place, and near where it will be, are brought into memory."""
+        """Move a client: load chunks near its place and near its predicted place."""
         reach = FURTHEST_SENSOR * self.live.resolution
         if not all(-reach < value < reach for value in position):
             raise BadRequest(f"position {position}: it is not finite, or too far away")
@@ -252,7 +252,7 @@ class ServedMap:
         self.live.move((session, "ahead"), ahead)
 
     def on_disconnect(self, session: int) -> None:
-        """Note that a session has ended: accepted scans are applied, other requests dropped."""
+        """Handle the end of a session: accepted scans are applied, other requests dropped."""
         for client in (session, (session, "ahead")):
             self.live.residency.leave(client)
         self._places.pop(session, None)
@@ -262,18 +262,18 @@ class ServedMap:
         self._waiting = deque(row for row in self._waiting if row[0].session != session)
         self._saves = [row for row in self._saves if row[0].session != session]
 
-    # --- what happens in the map ----------------------------------------------------------------
+    # --- changes of the map ----------------------------------------------------------------
 
     def chunk_changed(self, key: ChunkKey) -> None:
-        """Note that a chunk came into memory, or was changed there."""
+        """Record that a chunk was loaded into memory, or changed there."""
         self.changes.note_changed(key)
 
     def chunk_gone(self, key: ChunkKey) -> None:
-        """Note that a chunk left memory."""
+        """Record that a chunk left memory."""
         self.changes.note_gone(key)
 
     def scan_applied(self, scan: Scan) -> None:
-        """Answer all requests with this scan."""
+        """Answer all requests that contain this scan."""
         self._scans += 1
         durable = 0
         active = self.mappers.by_number.get(scan.mapper)
@@ -284,19 +284,19 @@ class ServedMap:
             self._answer(ticket, messages.LiveApplied(request, scan.number, durable))
 
     def _adopted_is_durable(self) -> bool:
-        """Whether all adopted chunks are on the disk: which scans made them is not known."""
+        """Return whether all adopted chunks are on disk; the scans in them are not known."""
         self._adopted = _left(self._adopted)
         return not self._adopted
 
     def scan_durable(self, scan: Scan) -> None:
-        """Note that a scan is on the disk."""
+        """Record that a scan is on disk."""
         self._durable += 1
         active = self.mappers.by_number.get(scan.mapper)
         if active is not None:
             active.unsaved.discard(scan.number)
 
     def _durable_scans(self) -> dict[int, int] | None:
-        """Return the scan up to which all of each mapper's are on the disk; None while that is unknown."""
+        """Return, for each mapper, the scan up to which all are on disk; None while that is unknown."""
         known = self._adopted_is_durable()
         return {number: one.durable for number, one in self.mappers.by_number.items()} if known else None
 
@@ -316,7 +316,7 @@ class ServedMap:
     # --- turns ----------------------------------------------------------------------------------
 
     def run_turn(self, now_s: float, *, save_all: bool) -> None:
-        """Do what can be done now."""
+        """Do the work that is possible now."""
         self._accept_scans()
         self.readers.lists.expire(now_s)
         residency = self.live.residency
@@ -333,7 +333,7 @@ class ServedMap:
             self.live.list_files(self._durable_scans())
 
     def next_turn_s(self, now_s: float) -> float:
-        """Return when the next turn is due, if nothing happens before."""
+        """Return the time at which the next turn is due, if nothing happens before."""
         residency = self.live.residency
         first_fits = bool(self._waiting) and residency.has_room(self._waiting[0][1].bytes)
         if first_fits or residency.is_ready:
@@ -381,15 +381,15 @@ class ServedMap:
 
     @property
     def is_saved(self) -> bool:
-        """Whether all is on the disk, too."""
+        """Whether all scans are on disk."""
         return self.live.all_durable
 
     def stop_accepting(self) -> None:
-        """Accept nothing more: scans that wait are sent again to the next run."""
+        """Stop accepting scans: waiting scans are sent again to the next run."""
         self._waiting.clear()
 
     def end(self, *, keep: bool) -> int:
-        """Close the map; return how many chunks stay in memory because they are nowhere else."""
+        """Close the map; return the number of unsaved chunks, which stay in memory."""
         self.readers.close()
         self.readers.lists.remove_all()
         unsaved = self.live.unsaved

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Lists of the voxels of an area, as files in shared memory: replies to requests for many voxels.
 
-A list is N x 3 int32, the voxels' indices, and behind them N int16, their log-odds in thousandths.  It takes
-memory within the map's budget, and is kept for as long as reading it takes: until its reader releases it,
-asks for more lists than a session may have, or disconnects, and for `KEPT_S` at most.  Then it is truncated
-to nothing, whatever its reader has open or mapped.
+A list is N x 3 int32, the voxels' indices, followed by N int16, their log-odds in thousandths.  Its memory
+counts towards the map's budget.  It is kept until its reader releases it, requests more lists than a session
+may have, or disconnects, and for `KEPT_S` at most.  Then it is truncated to nothing, even if its reader has
+it open or mapped.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ __all__ = ["Later", "Steps", "VoxelLists"]
 LISTS_PER_SESSION: Final = 4
 VOXEL_BYTES: Final = 14
 PART_OF_BUDGET: Final = 4
-"""All lists together may take this part of the map's budget."""
+"""Divisor of the map's budget for all lists together."""
 KEPT_S: Final = 10.0
 """How long a list is kept for its reader."""
 ROOM_S: Final = 10.0
-"""How long a list waits until chunks have made room for it."""
+"""How long a list waits until chunks are evicted for it."""
 ASK_AGAIN_S: Final = 0.005
 FILES_PER_STEP: Final = 8
-"""Chunks that a thread reads for a list before others have their turn."""
+"""Chunks that a thread reads for a list before it serves others."""
 BYTES_PER_STEP: Final = 256 << 10
 NAME: Final = "voxels."
 
@@ -63,7 +63,7 @@ class Later:
 Steps = Generator[Callable[[], Any] | Later | None, Any, Any]
 """A request in progress: yields None after a step, `Later`, or a function for a thread, and gets its outcome.
 
-What it returns is the reply.
+It returns the reply.
 """
 
 
@@ -76,12 +76,12 @@ class _List:
 
 @dataclass(eq=False)
 class VoxelLists:
-    """Makes lists of one map's voxels, a step at a time, beside its chunks.
+    """Makes lists of one map's voxels, step by step.
 
     Attributes
     ----------
     is_closed
-        Threads read no further file.
+        Whether the lists are closed: threads then read no further file.
     """
 
     live: PagedMap
@@ -97,12 +97,12 @@ class VoxelLists:
 
     @property
     def asked_bytes(self) -> int:
-        """The least memory that a list waits for; 0 if none waits."""
+        """The smallest amount of memory that a list waits for; 0 if none waits."""
         return min(self._asked.values(), default=0)
 
     @property
     def next_expiry_s(self) -> float:
-        """When the next list expires; infinity for never."""
+        """Time at which the next list expires; infinity for never."""
         return min((one.until_s for lists in self._lists.values() for one in lists), default=math.inf)
 
     def collect(
@@ -113,7 +113,7 @@ class VoxelLists:
         Raises
         ------
         OverBudget
-            The voxels need more memory than lists may take, or than is free just now.
+            The voxels need more memory than lists may use, or than is free at present.
         MapDataError
             A file cannot be read.
         OSError
@@ -168,7 +168,7 @@ class VoxelLists:
         return indices[wanted], log_odds[wanted]
 
     def _read(self, keys: list[ChunkKey], pick: Callable[[ChunkView], _Part]) -> list[_Part]:
-        """Return voxels of chunks as last saved; runs in a thread."""
+        """Return voxels of chunks as last saved; called in a thread."""
         found = []
         for key in keys:
             if self.is_closed:
@@ -186,7 +186,7 @@ class VoxelLists:
         return found
 
     def _room(self, nbytes: int) -> Steps:
-        """Wait until chunks have made room."""
+        """Wait until chunks are evicted for a list."""
         number = secrets.randbits(62)
         until_s = time.monotonic() + ROOM_S
         try:
@@ -243,7 +243,7 @@ class VoxelLists:
             self._remove(one)
 
     def expire(self, now_s: float) -> None:
-        """Remove lists that have been kept for long enough."""
+        """Remove expired lists."""
         for lists in self._lists.values():
             for one in [one for one in lists if one.until_s <= now_s]:
                 lists.remove(one)
@@ -255,7 +255,7 @@ class VoxelLists:
             self._remove(one)
 
     def remove_all(self) -> None:
-        """Remove all lists, those of previous runs too."""
+        """Remove all lists, including those of previous runs."""
         for session in list(self._lists):
             self.on_disconnect(session)
         start = self.live.memory.prefix.lstrip("/") + NAME
@@ -268,11 +268,9 @@ class VoxelLists:
         self._free(one.name)
 
     def _free(self, name: str) -> None:
-        """Free a file's memory, whatever readers do with it, and remove its name."""
+        """Free a file's memory, even while readers use it, and remove its name."""
         path = self.live.memory.path + name
-        with contextlib.suppress(
-            FileNotFoundError, PermissionError
-        ):  # a file of another user is none of ours
+        with contextlib.suppress(FileNotFoundError, PermissionError):  # files of other users are left alone
             try:
                 fd = os.open(path, os.O_WRONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
             except OSError as error:
@@ -287,5 +285,5 @@ class VoxelLists:
 
 
 def _pages(nbytes: int) -> int:
-    """Return the memory that this many bytes of a file take."""
+    """Return the memory used by a file of this many bytes."""
     return -(-nbytes // mmap.PAGESIZE) * mmap.PAGESIZE
