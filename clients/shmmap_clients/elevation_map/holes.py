@@ -2,8 +2,8 @@
 """Fills holes of a grid from the heights around them, in floating point.
 
 A column without a height is filled if there is a known height within the radius, and at least three within
-the radius plus two columns.  Its value is that of the best plane through these heights, weighted by 1 /
-distance², at the column's centre, so that a slope continues through a hole.  If these heights lie on one
+the radius plus two columns.  Its value is that of the best plane through these heights, weighted by
+1 / distance², at the column's centre, so that a slope continues through a hole.  If these heights lie on one
 line, the value is their weighted mean.  Upstream inpaints an 8-bit image of the whole map, where 100 m of
 relief have steps of 0.39 m.
 """

@@ -124,7 +124,7 @@ class InitializerRules:
         Time for the map to load, seconds.  The first use on a machine compiles the kernels of its layers,
         which takes a minute or more on a slow or busy one.
     seed
-        Seed of the search, which the seed makes reproducible.
+        Seed of the random candidates; the same seed gives the same search.
     """
 
     map_radius: float = 150.0

@@ -56,9 +56,7 @@ def in_order(files: Sequence[Path]) -> list[Path]:
     digits = [fraction for _, fraction in fractions if len(fraction) > 1]
     padded = any(fraction.startswith("0") for fraction in digits)
     rounded = any(fraction.endswith("0") for fraction in digits)
-    if (
-        padded or not rounded
-    ):  # a counter without leading zeros reaches 10, a decimal number has no trailing zero
+    if padded or not rounded:  # a counter without padding reaches 10, decimals have no trailing zero
         return decimal
     series: dict[str, set[int]] = {}
     for whole, fraction in fractions:
