@@ -358,7 +358,7 @@ class Client {
     }
   }
 
-  /// Throws Interrupted where the program does not want to wait any longer.
+  /// Throws Interrupted if the program ends the wait.
   void check_waiting() const {
     if (options_.keep_waiting && !options_.keep_waiting())
       throw Interrupted("interrupted", path() + ": the program has ended the wait for the daemon's answer");
@@ -371,12 +371,12 @@ class Client {
                        "ask for fewer cells at a time, or send versions (packed) in place of names");
   }
 
-  /// Send a request until it is answered; `reply` is what came.
+  /// Send a request, repeatedly if necessary, until it is answered; `reply` receives the answer.
   void ask(std::uint64_t number, const std::string& message, std::string_view tag, double wait, std::string& reply) {
     check_size(message);
     const auto deadline = after(wait + options_.timeout);
     double pause = wait + 1.0;
-    bool may_be_back = true;  // the first time it is asked at once
+    bool may_be_back = true;  // the first retry is immediate
     while (true) {
       try {
         connect();
@@ -394,7 +394,7 @@ class Client {
         disconnect();
         if (error.code() == "no_answer" || error.code() == "no_permission" || Clock::now() >= deadline) throw;
         check_waiting();
-        if (!std::exchange(may_be_back, false)) ::poll(nullptr, 0, look_again.count());  // it does not announce when it listens
+        if (!std::exchange(may_be_back, false)) ::poll(nullptr, 0, look_again.count());  // it sends no notification
       }
     }
   }
