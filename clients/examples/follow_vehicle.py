@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Keep the map around a moving vehicle.
 
-    python3 follow_vehicle.py X Y           # metres; drives 40 m along x from there, at 10 m/s
+    python3 follow_vehicle.py X Y           # metres; start; drives 40 m along x, at 10 m/s
 
-A `MapWindow` holds the cells around a pose in shared memory.  The vehicle's loop gives it each pose; a thread
-of the window asks the daemon for what is new, so that `move_to` never waits.
+A `MapWindow` holds the cells around a pose in shared memory.  The vehicle's loop passes each pose to it; a
+thread of the window requests new cells from the daemon, so that `move_to` never waits.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ PERIOD_S = 0.02
 
 
 def drive(window: shmmap.MapWindow, x: float, y: float) -> None:
-    """Move along x, and print what comes and goes."""
-    window.move_to(x, y, wait=10.0)  # before the vehicle starts: the daemon reads the first cells
+    """Move along x, and print the cells that are added and removed."""
+    window.move_to(x, y, wait=10.0)  # before the start: wait until the daemon has read the first cells
     for step in range(200):
         here = x + SPEED * PERIOD_S * step
-        update = window.move_to(here, y, vx=SPEED, vy=0.0)  # the velocity: what lies ahead is loaded early
+        update = window.move_to(here, y, vx=SPEED, vy=0.0)  # the velocity lets the daemon prefetch
         if update.any:
             new, gone = len(update.added), len(update.removed)
             print(f"x {here:.1f} m: {new} cells new, {gone} gone, {len(window.cells)} in the window")
-        # The window serves what it has while the daemon is away, and finds it again.
+        # While the daemon is away, the window keeps its cells; later it reconnects.
         if window.error is not None:
             print(f"x {here:.1f} m: {window.error}", file=sys.stderr)
         time.sleep(PERIOD_S)
-    # Points are read where they lie; only `gather` copies.
+    # Points are read in place; only `gather` copies.
     near = window.points_around(here, y, 20.0)
     print(f"{near.count()} points within 20 m{'' if near.covered else ', and more to come'}")
 

@@ -3,8 +3,8 @@
 
     python3 points_in_torch.py X Y RADIUS             # metres, map frame
 
-`Cell.to_torch` gives tensors over the cell's shared memory.  They may be written: a page that is written
-becomes this process's own, and no other program sees it.
+`Cell.to_torch` returns tensors over the cell's shared memory.  They are writable: writing to a page makes a
+private copy of it, which no other program sees.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ import shmmap
 
 
 def main() -> int:
-    """Find where the points are, and along which axes they spread."""
+    """Print the mean of the points, and their spread along the principal axes."""
     x, y, radius = map(float, sys.argv[1:4])
     with shmmap.connect() as client:
         tensors = [cell.to_torch()["xyz"] for cell in client.around(x, y, radius, wait=60.0)]
-    # Cells outlive the client.  Sums are about the place that was asked for, in double precision.
+    # Cells remain valid after the client is closed.  Sums are relative to the requested place, in doubles.
     place = torch.tensor([x, y, 0.0], dtype=torch.float64)
     points = torch.cat([xyz.double() - place for xyz in tensors])  # the only copy
     spread = torch.linalg.eigh(torch.cov(points.T)).eigenvalues.clamp(min=0.0).sqrt()

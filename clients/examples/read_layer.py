@@ -16,16 +16,16 @@ import shmmap
 
 
 def main() -> int:
-    """Ask for the layer and read its columns."""
+    """Request the layer and read its columns."""
     x, y, radius = map(float, sys.argv[1:4])
     with shmmap.connect() as client:
         # wait: the first request computes the layer, and compiles its kernel on a new machine
         cells = client.around(x, y, radius, layers="voxel(leaf=0.5)", wait=60.0)
-        # What cannot be loaded is a value, cell by cell; the others are there.
+        # Errors are values, one for each cell that cannot be loaded; the other cells are usable.
         for failure in cells.failed:
             print(failure, file=sys.stderr)
         for cell in cells:
-            # Columns are numpy arrays over shared memory, read-only; `origin` is added where it is not zero.
+            # Columns are numpy arrays over shared memory, read-only; add `origin` if it is not zero.
             means, counts = cell["xyz"], cell["count"]
             low, high = means.min(axis=0) + cell.origin, means.max(axis=0) + cell.origin
             print(

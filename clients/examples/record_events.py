@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Record what happens in the daemon, a line of JSON for each event.
+"""Record events of the daemon, as a line of JSON for each.
 
     python3 record_events.py events.jsonl             # until Ctrl-C
     python3 record_events.py events.jsonl 60          # for a minute
 
-Events are numbered, and the daemon remembers the latest few thousand: a reader that was slow, or connected
-again after a restart of the daemon, asks for those in between.  What is lost all the same is reported.
+Events are numbered, and the daemon keeps the latest few thousand.  A reader that was slow, or that reconnects
+after a restart of the daemon, requests the events that it missed.  Events lost nevertheless are reported.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def main() -> int:
     end_s = time.monotonic() + float(seconds[0]) if seconds else float("inf")
     with (
         open(path, "ab") as file,
-        shmmap.events.EventStream(since=60.0) as events,  # begin with those of the last minute
+        shmmap.events.EventStream(since=60.0) as events,  # begin with events of the last minute
         contextlib.suppress(KeyboardInterrupt),
     ):
         while (left_s := end_s - time.monotonic()) > 0:

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write a layer kind of your own: how rough the ground is, as the standard deviation of z in each square.
+"""Define a layer kind: roughness of the ground, as the standard deviation of z in each square.
 
-A package offers a kind by one entry point, in its pyproject.toml:
+A package provides a kind by an entry point in its pyproject.toml:
 
     [project.entry-points."shmmap.layers"]
     roughness = "roughness_layer:KIND"
 
-Install the package beside shmmap and restart the daemon: clients then ask for ``roughness(edge=1.0)``.
+Install the package next to shmmap and restart the daemon; clients can then request ``roughness(edge=1.0)``.
 
     python3 roughness_layer.py                        # checks the kind, without a daemon
 """
@@ -20,7 +20,7 @@ from shmmap.layers.contract import Columns, LayerColumn, Parameter, Parameters, 
 
 
 def build(points: PointTable, parameters: Parameters) -> LayerTable:
-    """Return the layer of one cell: a pure function, so that every process makes the same bytes."""
+    """Return the layer of one cell; a pure function, so that every process computes the same bytes."""
     xyz = points.xyz[points.finite()].astype(np.float64)
     index = np.floor(xyz[:, :2] / parameters["edge"]).astype(np.int64)
     squares, member = np.unique(index, axis=0, return_inverse=True)
@@ -34,7 +34,7 @@ def build(points: PointTable, parameters: Parameters) -> LayerTable:
 
 KIND = LayerKind(
     name="roughness",
-    builder_version=1,  # raise it with every change of the bytes: caches then build the layer again
+    builder_version=1,  # increase it when the output changes, so that caches rebuild the layer
     summary="standard deviation of z in each square of the ground",
     borders="a square that the border cuts is in each cell, from that cell's points alone",
     parameters=(Parameter("edge", float, "side of a square", unit="m", above=0.0, required=True),),
@@ -47,11 +47,11 @@ KIND = LayerKind(
 
 
 def main() -> None:
-    """Check on clouds of every sort that it keeps what all kinds keep."""
+    """Check the contract of layer kinds on clouds of every sort."""
     from shmmap.layers.spec import register
     from shmmap.testing.layer_conformance import CORNERS, check_layer
 
-    register(KIND)  # in this process, as the entry point does in all of them
+    register(KIND)  # in this process; the entry point does it in all processes
     for cloud in CORNERS:
         check_layer(f"{KIND.name}(edge=1.0)", cloud)
     print(f"{KIND.describe()} is a layer kind")

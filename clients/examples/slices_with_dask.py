@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compute layers of a published map on a dask cluster, slice by slice, and join them.
 
-A slice is the command ``shmmap prepare URL --layer ... --shards I/N``, run by the worker that is free next;
-if a worker is lost, another one makes its slice.  Workers need shmmap with its extra ``remote``, and the
+A slice is the command ``shmmap prepare URL --layer ... --shards I/N``, run by the next free worker; if a
+worker is lost, another one computes its slice.  Workers need shmmap with its extra ``remote``, and the
 store's credentials in their environment.
 
     python3 slices_with_dask.py s3://maps/town --layer 'ndt(leaf=2.0)' --slices 64 --scheduler tcp://HOST:8786
@@ -20,7 +20,7 @@ from dask.distributed import Client, as_completed
 
 
 def prepare_slice(url: str, layers: list[str], number: int, slices: int) -> dict[str, Any]:
-    """Make one slice; returns the report of `shmmap prepare`, which names the run."""
+    """Compute one slice; return the report of `shmmap prepare`, which names the run."""
     done = subprocess.run(
         [
             *(sys.executable, "-m", "shmmap.cli", "prepare", url, "--layer", *layers),
@@ -37,8 +37,8 @@ def prepare_slice(url: str, layers: list[str], number: int, slices: int) -> dict
 
 
 def prepare_on(client: Client, url: str, layers: list[str], slices: int) -> str:
-    """Make all slices on a cluster; returns the name of the run."""
-    # the same slice gives the same bytes on any worker: dask may repeat it
+    """Compute all slices on a cluster; return the name of the run."""
+    # a slice has the same bytes on any worker, so that dask may repeat it
     futures = [
         client.submit(prepare_slice, url, layers, number, slices, retries=2, pure=False)
         for number in range(1, slices + 1)
@@ -54,7 +54,7 @@ def prepare_on(client: Client, url: str, layers: list[str], slices: int) -> str:
 
 
 def main() -> int:
-    """Prepare and join."""
+    """Compute all slices, then join them."""
     parser = argparse.ArgumentParser(description="Add layers to a published map, on a dask cluster.")
     parser.add_argument("url", metavar="URL", help="where the map is published")
     parser.add_argument("--layer", metavar="SPEC", nargs="+", required=True, help="such as 'ndt(leaf=2.0)'")

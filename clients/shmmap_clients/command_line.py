@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the programs are run: verbs, errors, exit codes, progress.
+"""Common parts of running the programs: verbs, errors, exit codes, progress.
 
 Exit codes are those of ``shmmap``: 0 done; 1 a negative answer, or nothing found; 2 wrong usage; 65 bad data;
-66 no file or no map there; 69 no daemon answers, or a package is missing; 70 internal error; 73 an output
+66 no such file or map; 69 no daemon answers, or a package is missing; 70 internal error; 73 an output
 cannot be written; 75 busy; 130 interrupted, 143 ended by SIGTERM.
 """
 
@@ -70,16 +70,16 @@ __all__ = [
 def run_program(
     name: str, description: str, add_verbs: Sequence[Callable[[Any], None]], argv: Sequence[str] | None = None
 ) -> int:
-    """Run a verb of a program and return the exit code, as ``shmmap`` itself has them.
+    """Run a verb of a program and return the exit code, with the codes of ``shmmap``.
 
     Parameters
     ----------
     name, description
-        For the help.
+        Texts of the help.
     add_verbs
-        Each adds the parser of a verb, with ``run`` as a default, to the subparsers.
+        Functions that each add the parser of a verb, with ``run`` as a default, to the subparsers.
     argv
-        Words after the program's name; those of this process by default.
+        Arguments after the program's name; by default those of this process.
     """
     parser = Parser(prog=name, description=description)
     subparsers = parser.add_subparsers(title="verbs", metavar="VERB", required=True, parser_class=Parser)
@@ -97,18 +97,18 @@ def run_command(
     *,
     epilog: str = "",
 ) -> int:
-    """Run a program that has no verbs; returns the exit code.
+    """Run a program without verbs and return the exit code.
 
     Parameters
     ----------
     name, description, epilog
-        For the help; the epilog is shown as it is written.
+        Texts of the help; the epilog is shown verbatim.
     add_options
         Adds the options to a parser.
     run
-        Does the work.
+        Runs the program with the parsed options.
     argv
-        Words after the program's name; those of this process by default.
+        Arguments after the program's name; by default those of this process.
     """
     parser = Parser(
         prog=name,
@@ -135,9 +135,9 @@ def _guarded(name: str, parser: argparse.ArgumentParser, argv: Sequence[str] | N
 
 @contextlib.contextmanager
 def _ended_as_interrupted() -> Iterator[list[int]]:
-    """Make SIGTERM, and SIGHUP unless it is ignored, end a program as Ctrl-C does: it cleans up.
+    """Make SIGTERM, and SIGHUP unless ignored, end a program with cleanup, as Ctrl-C does.
 
-    Yields a list that holds the signal then; a second signal ends the process at once.
+    Yields a list to which the signal is added.  A second signal ends the process at once.
     """
     ended_by: list[int] = []
     handled: list[signal.Signals] = []
@@ -157,12 +157,12 @@ def _ended_as_interrupted() -> Iterator[list[int]]:
         yield ended_by
     finally:
         for number in handled:
-            if signal.getsignal(number) is end:  # no other handler was installed since
+            if signal.getsignal(number) is end:  # no other handler has been installed since
                 signal.signal(number, signal.SIG_DFL)
 
 
 def positive(text: str) -> float:
-    """Read a positive and finite number."""
+    """Parse a positive, finite number."""
     value = _number(text)
     if not 0.0 < value < math.inf:
         raise argparse.ArgumentTypeError(f"expected a positive number, not {text!r}")
@@ -170,7 +170,7 @@ def positive(text: str) -> float:
 
 
 def not_negative(text: str) -> float:
-    """Read a finite number that is not negative."""
+    """Parse a finite number that is not negative."""
     value = _number(text)
     if not 0.0 <= value < math.inf:
         raise argparse.ArgumentTypeError(f"expected a number, 0 or more, not {text!r}")
@@ -178,7 +178,7 @@ def not_negative(text: str) -> float:
 
 
 def finite(text: str) -> float:
-    """Read a finite number."""
+    """Parse a finite number."""
     value = _number(text)
     if not math.isfinite(value):
         raise argparse.ArgumentTypeError(f"expected a number, not {text!r}")
@@ -193,14 +193,14 @@ def _number(text: str) -> float:
 
 
 class ProgressLine:
-    """What a program is doing, on stderr.
+    """Progress of a program on stderr.
 
     Parameters
     ----------
     quiet
-        Show nothing.
+        Whether to show nothing.
     written_over
-        Each text takes the place of the one before, as on a terminal; else each is a line.
+        Whether each text overwrites the one before, as on a terminal; else each text is a line.
     """
 
     def __init__(self, *, quiet: bool, written_over: bool) -> None:
@@ -215,7 +215,7 @@ class ProgressLine:
         self.end()
 
     def show(self, text: str) -> None:
-        """Show what is being done."""
+        """Show a progress text."""
         if self.quiet:
             return
         text = printable(text)
@@ -227,7 +227,7 @@ class ProgressLine:
         sys.stderr.flush()
 
     def end(self) -> None:
-        """End the line, so that the next text begins one."""
+        """End the line, so that the next text begins a new one."""
         if self._shown:
             sys.stderr.write("\n")
             self._shown = ""

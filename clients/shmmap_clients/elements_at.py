@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""For kernels over many arrays at once, whose addresses are rows of a table: elements at an address.
+"""Elements of arrays by address, for kernels over many arrays whose addresses are in a table.
 
-``float32_at(address, index)`` and its like; `shmmap.compiling` compiles the kernels.
+Functions such as ``float32_at(address, index)``; `shmmap.compiling` compiles the kernels.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the map is, for messages about places that it does not have."""
+"""Extent of the map, for messages about positions outside it."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ __all__ = ["NoMapHere", "extent_text", "map_extent"]
 
 
 class NoMapHere(ShmmapError):
-    """The map has nothing around the place that was asked for."""
+    """The map has no cells around the requested position."""
 
     code = "no_map_here"
     exit_code = 1
 
 
 def extent_text(bounds: Sequence[float] | None, position: Iterable[float] = ()) -> str:
-    """Return where a map is, and where a pose is: ``"the map spans x -60 .. 60 m, y -60 .. 60 m"``.
+    """Return the extent of a map, and a position, as text: ``"the map spans x -60 .. 60 m, y -60 .. 60 m"``.
 
     Parameters
     ----------
     bounds
-        min_x, min_y, max_x, max_y, metres, map frame; None for a map of nothing.
+        min_x, min_y, max_x, max_y, metres, map frame; None for an empty map.
     position
-        Of the pose, metres, map frame: x, y and perhaps z; by default it is left out.
+        Position of a pose, metres, map frame: x, y and optionally z; by default none.
     """
     pose = ", ".join(f"{value:.3f}" for value in position)
     where = f", the pose is at ({pose})" if pose else ""
@@ -36,5 +36,5 @@ def extent_text(bounds: Sequence[float] | None, position: Iterable[float] = ()) 
 
 
 def map_extent(client: Client, position: Iterable[float] = ()) -> str:
-    """Return where the daemon's map is, as `extent_text`."""
+    """Return the extent of the daemon's map, as `extent_text`."""
     return extent_text(client.welcome.bounds, position)

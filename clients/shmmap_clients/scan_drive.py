@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The scans of a drive, one after the other through one step, and what a program prints of each."""
+"""Loop over the scans of a drive: a step for each scan, and the program's reports."""
 
 from __future__ import annotations
 
@@ -29,41 +29,41 @@ _Outcome = TypeVar("_Outcome", contravariant=True)
 
 
 class DriveReport(Protocol[_Outcome]):
-    """Counts the outcomes, and puts each in words."""
+    """Counter of the outcomes, which also describes them."""
 
     def add(self, outcome: _Outcome, /) -> None:
         """Count the next scan."""
 
     def line(self, outcome: _Outcome, /) -> str:
-        """Return the progress after that scan."""
+        """Return the progress after the scan as text."""
 
 
 class ScanDrive:
-    """The scans that a program's ``--scans`` names.
+    """The scans of a program's ``--scans``.
 
     Parameters
     ----------
     args
-        Of the program: ``scans``, ``quiet``, ``allow_empty``, and ``json_lines`` where it has that option.
+        Options of the program: ``scans``, ``quiet``, ``allow_empty``, and ``json_lines`` if it has it.
     name
-        The program's.
+        Name of the program.
     poses
         File with the poses of a directory's scans, if there is one.
     stack
-        Closes the subscription and the files.
+        Exit stack that closes the subscription and the files.
     reader
-        How files are read, and which points count; by default as the options say.
+        Reader of files, which also filters points; by default from the options.
     one_line
-        Progress is one line of a terminal, which is written over; by default it is a line for each scan.
+        Whether progress is one line of a terminal, overwritten each time; by default a line a scan.
     rate
-        Scans a second that a directory is read at most, if that is given.
+        Largest number of scans a second from a directory, if any.
 
     Attributes
     ----------
     reader
-        Reads the scans, and has counted which points were left out.
+        Reader of the scans, with counts of the points left out.
     scans
-        As `open_scans` returns them.
+        Scans from `open_scans`.
 
     Raises
     ------
@@ -96,14 +96,14 @@ class ScanDrive:
         self._lines = sys.stdout if lines == "-" else self.open_text(lines) if lines else None
 
     def open_text(self, path: str) -> TextIO:
-        """Open a file to write until the end; what keeps it from being written is `CannotWrite`."""
+        """Open a file for writing until the end; errors of writing raise `CannotWrite`."""
         with writing_errors(path):
             file = open(path, "w", encoding="utf-8")  # noqa: SIM115
         self._stack.enter_context(writing_errors(path))
         return self._stack.enter_context(file)
 
     def first(self) -> Scan | None:
-        """Wait for the first scan, with which `run` begins all the same; None where there is none."""
+        """Wait for the first scan, without consuming it: `run` begins with it; None if there is none."""
         coming = self._begin()
         scan = next(coming, None)
         if scan is not None:
@@ -118,23 +118,23 @@ class ScanDrive:
         *,
         max_scans: int | None = None,
     ) -> None:
-        """Go through the scans to their end.
+        """Process all scans.
 
         Parameters
         ----------
         step
-            What is done with a scan.
+            Processes a scan.
         report
-            Counts the outcome, and puts it in words for stderr.
+            Counts the outcome, and describes it for stderr.
         document
-            Returns what ``--json-lines`` writes of it.
+            Returns the JSON object that ``--json-lines`` writes for the outcome.
         max_scans
-            Number of scans that are taken at most, if that is given.
+            Largest number of scans, if any.
 
         Raises
         ------
         ShmmapError
-            A scan cannot be read, or the step cannot be done.
+            A scan cannot be read, or the step fails.
         """
         for scan in islice(self._begin(), max_scans):
             outcome = step(scan)
@@ -146,16 +146,16 @@ class ScanDrive:
                 self._progress.show(report.line(outcome))
 
     def say(self, text: str, hint: str = "") -> None:
-        """Print on stderr what a reader has to know."""
+        """Print a note on stderr."""
         self._progress.end()
         complain(self._name, text, hint)
 
     def no_scans(self) -> int:
-        """Print that there was no scan and return the exit code."""
+        """Report that there was no scan, and return the exit code."""
         return nothing_found(self._args, f"no scan came from {self._args.scans}", name=self._name)
 
     def _begin(self) -> Iterator[Scan]:
-        """Return the scans that have not been taken; those of a publisher are waited for from now on."""
+        """Return the remaining scans; from now on, wait for scans of a publisher."""
         if self._coming is None:
             endpoint = is_endpoint(self._args.scans)
             if endpoint and not self._args.quiet:
@@ -165,23 +165,23 @@ class ScanDrive:
 
 
 def open_scans(source: str, poses: str | None, stack: ExitStack, reader: ScanReader) -> Iterable[Scan]:
-    """Return the scans of a directory, or those of a publisher as they come.
+    """Return the scans of a directory, or of a publisher as they arrive.
 
     Parameters
     ----------
     source
-        Directory or address.
+        Directory of scans, or address of a publisher.
     poses
         File with T_map_sensor of each scan of a directory; the first and the last pair are printed.
     stack
-        Closes a subscription.
+        Exit stack that closes a subscription.
     reader
-        How files are read, and which points of files and messages count.
+        Reader of files, which also filters points of files and messages.
 
     Raises
     ------
     BadRequest
-        A file of poses for scans of a publisher, which bring their own; or the address makes no sense.
+        ``poses`` is given for a publisher, whose scans include poses; or the address is invalid.
     MapMissing, MapDataError
         The directory or the file cannot be read.
     """

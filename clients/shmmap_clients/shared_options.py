@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options that several programs have: the same name, value and help wherever they mean the same.
+"""Options of several programs, with the same name, value and help in all of them.
 
-Poses are ``X,Y,Z,ROLL,PITCH,YAW`` in metres and radians, or as ``--pose-format`` says.
+Poses are ``X,Y,Z,ROLL,PITCH,YAW`` in metres and radians, or in the format of ``--pose-format``.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ _FORMATS: Final = {"rpy": _POSE, "tum": "X,Y,Z,QX,QY,QZ,QW", "xyyaw": "X,Y,YAW"}
 
 
 def add_scan_option(parser: Parser) -> None:
-    """Add ``--scan``, a file as `shmmap_clients.scans.scan_file` reads it, and how it is read."""
+    """Add ``--scan``, a file for `shmmap_clients.scans.scan_file`, and the options of reading it."""
     parser.add_argument(
         "--scan",
         required=True,
@@ -74,7 +74,7 @@ def add_scan_option(parser: Parser) -> None:
 
 
 def add_scans_option(parser: Parser, *, min_range: bool = True) -> None:
-    """Add ``--scans``, see `shmmap_clients.scan_drive.open_scans`, and how they are read."""
+    """Add ``--scans``, see `shmmap_clients.scan_drive.open_scans`, and the options of reading them."""
     parser.add_argument(
         "--scans",
         required=True,
@@ -137,15 +137,15 @@ def add_min_range_option(parser: Parser) -> None:
 
 
 def reader_from(args: argparse.Namespace, name: str, **settings: Any) -> ScanReader:
-    """Return what reads scans as the options say; what a user should know goes to stderr, unless ``--quiet``.
+    """Return a reader of scans with the options; it prints notes on stderr, unless ``--quiet``.
 
     Parameters
     ----------
     args
     name
-        The program's.
+        Name of the program.
     settings
-        Of `ScanReader`, instead of the options.
+        Settings of `ScanReader` that override the options.
     """
     from shmmap_clients.scans.scan_file import ScanReader
 
@@ -203,7 +203,7 @@ def add_backend_option(parser: Parser) -> None:
 
 
 def add_threads_option(parser: Parser, *, all_processors: bool = False) -> None:
-    """Add ``--threads``; by default one, or as many as there are processors, but at most four."""
+    """Add ``--threads``; by default one, or the number of processors, but at most four."""
     parser.add_argument(
         "--threads",
         type=int,
@@ -250,7 +250,7 @@ def add_height_option(parser: Parser, *, default: float | None, shown: str) -> N
 
 
 def add_scoring_options(parser: Parser, *, all_processors: bool = False) -> None:
-    """Add ``--backend``, ``--fallback``, ``--threads`` as `add_threads_option`, and devices' options."""
+    """Add ``--backend``, ``--fallback``, ``--threads`` (see `add_threads_option`), and devices' options."""
     parser.add_argument(
         "--backend",
         default="numba",
@@ -292,14 +292,14 @@ def add_device_options(parser: Parser) -> None:
 
 
 def device_options_from(args: argparse.Namespace) -> DeviceOptions:
-    """Return which device is asked for, and how."""
+    """Return the device options: which device, precision and memory."""
     from shmmap_clients.ndt_scan_matcher import DeviceOptions
 
     return DeviceOptions(args.device, args.precision, args.memory)
 
 
 def scoring_settings(args: argparse.Namespace) -> dict[str, Any]:
-    """Return what `Settings` has of these options."""
+    """Return the values of these options for `Settings`."""
     return {"backend": args.backend, "device": device_options_from(args), "fallback": args.fallback}
 
 
@@ -362,7 +362,7 @@ def add_trust_options(parser: argparse.ArgumentParser) -> None:
 
 
 def trust_from(args: argparse.Namespace) -> TrustLimits:
-    """Return the limits of trust that the options ask for."""
+    """Return the limits of trust of the options."""
     from shmmap_clients.ndt_scan_matcher import TrustLimits
 
     return TrustLimits(
@@ -378,7 +378,7 @@ def trust_from(args: argparse.Namespace) -> TrustLimits:
 
 
 def pose_numbers(text: str) -> tuple[float, ...]:
-    """Read numbers with commas between them; `pose_from` knows how many there should be."""
+    """Parse numbers separated by commas; `pose_from` checks their count."""
     try:
         values = tuple(float(word) for word in text.split(","))
     except ValueError:
@@ -402,12 +402,12 @@ def add_pose_format_option(parser: argparse.ArgumentParser | argparse._ArgumentG
 
 
 def pose_from(args: argparse.Namespace, option: str) -> NDArray[np.float64]:
-    """Return the pose that an option (``"--init"``) was given, (4, 4) float64, metres, map frame.
+    """Return the pose in the value of an option (``"--init"``), (4, 4) float64, metres, map frame.
 
     Raises
     ------
     BadRequest
-        It has not as many numbers as ``--pose-format`` wants, or its quaternion is none.
+        The count of numbers differs from ``--pose-format``, or the quaternion is invalid.
     """
     from shmmap_clients.scans.trajectory import matrix_of
 
@@ -427,14 +427,14 @@ def pose_from(args: argparse.Namespace, option: str) -> NDArray[np.float64]:
 
 
 def pose_text(T: NDArray[np.float64], pose_format: str) -> str:
-    """Return a pose, (4, 4), as `pose_from` reads it: numbers with commas between them.
+    """Return a pose, (4, 4), as text for `pose_from`: numbers separated by commas.
 
     Parameters
     ----------
     T
-        Metres, map frame.
+        Pose, metres, map frame.
     pose_format
-        As ``--pose-format`` names it; ``xyyaw`` leaves out height, roll and pitch.
+        Value of ``--pose-format``; ``xyyaw`` omits height, roll and pitch.
     """
     from shmmap_clients.scans.trajectory import quaternion_of
 
@@ -449,7 +449,7 @@ def pose_text(T: NDArray[np.float64], pose_format: str) -> str:
 
 
 def _numbers(metres: tuple[float, ...], rotation: tuple[float, ...]) -> str:
-    """Write metres to the millimetre, and rotations to the microradian; no number is -0."""
+    """Format metres to the millimetre, and rotations to the microradian, without -0."""
     words = [f"{round(value, 3) + 0.0:.3f}" for value in metres]
     return ",".join(words + [f"{round(value, 6) + 0.0:.6f}" for value in rotation])
 

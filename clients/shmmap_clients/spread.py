@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A stream of any length in bounded memory: some of its values, and how numbers are distributed."""
+"""Streams of any length in bounded memory: a sample of values, and the distribution of numbers."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ T = TypeVar("T")
 
 
 class Decimated(Generic[T]):
-    """Keeps all values until there are ``most``, from then on every second, fourth, eighth, ... one.
+    """Sample of a stream: all values up to ``most``, then every second, fourth, eighth, ... one.
 
     Parameters
     ----------
     most
-        How many values are kept at most; at least 2.
+        Largest number of kept values; at least 2.
     """
 
     def __init__(self, most: int = KEPT) -> None:
@@ -32,7 +32,7 @@ class Decimated(Generic[T]):
         self.values: list[T] = []
 
     def add(self, value: T) -> None:
-        """Take the next value of the stream."""
+        """Add the next value of the stream."""
         if self._count % self._stride == 0:
             if len(self.values) == self._most:
                 del self.values[1::2]
@@ -44,7 +44,7 @@ class Decimated(Generic[T]):
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """How numbers are distributed; NaN where there are none."""
+    """Distribution of numbers; NaN if there are none."""
 
     mean: float
     variance: float
@@ -54,10 +54,10 @@ class Spread:
 
 
 class RunningSpread:
-    """Takes number after number; its size does not depend on how many.
+    """Running distribution of numbers, in constant memory.
 
-    Mean, variance and maximum are of all numbers (Welford 1962); percentiles too while there are few, later
-    they are those of some thousand numbers taken evenly from the whole stream (`Decimated`).
+    Mean, variance and maximum are over all numbers (Welford 1962).  So are percentiles of short streams; for
+    longer ones they are over thousands of numbers, evenly from the whole stream (`Decimated`).
     """
 
     def __init__(self) -> None:
@@ -68,7 +68,7 @@ class RunningSpread:
         self._sample: Decimated[float] = Decimated()
 
     def add(self, value: float) -> None:
-        """Take one number."""
+        """Add a number."""
         self.count += 1
         before = value - self._mean
         self._mean += before / self.count
@@ -86,11 +86,11 @@ class RunningSpread:
 
     @property
     def root_mean_square(self) -> float:
-        """Root mean square of the numbers so far; NaN where there are none."""
+        """Root mean square of the numbers so far; NaN if there are none."""
         return math.sqrt(self._mean**2 + self._squares / self.count) if self.count else math.nan
 
     @property
     def document(self) -> dict[str, float] | None:
-        """Median, 99th percentile and maximum, for JSON; None where there are no numbers."""
+        """Median, 99th percentile and maximum, for JSON; None if there are no numbers."""
         spread = self.spread
         return {"p50": spread.p50, "p99": spread.p99, "max": spread.max} if self.count else None

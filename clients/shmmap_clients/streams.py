@@ -14,28 +14,28 @@ from shmmap import BadRequest
 
 __all__ = ["Publisher", "Subscriber", "is_endpoint"]
 
-_REPEAT_MS: Final = 100  # between two ends
+_REPEAT_MS: Final = 100  # between two repetitions of the end
 
 _Publisher = TypeVar("_Publisher", bound="Publisher")
 _Subscriber = TypeVar("_Subscriber", bound="Subscriber")
 
 
 def is_endpoint(text: str) -> bool:
-    """Whether this is an address, not a file or directory."""
+    """Return whether this is an address, not a file or directory."""
     return "://" in text
 
 
 class Publisher:
-    """Binds an endpoint and sends to all subscribers.
+    """Publisher that binds an endpoint and sends to all subscribers.
 
     Parameters
     ----------
     endpoint
         Address to bind, such as ``ipc:///tmp/scans`` or ``tcp://127.0.0.1:5600``.
     queue
-        How many messages may wait for a slow reader; it misses those beyond.
+        Largest number of messages queued for a slow reader, which misses further ones.
     linger_ms
-        How long `close` may take to deliver what is queued, and to wait until readers have received the end.
+        Time for `close` to deliver queued messages, and to wait until readers have received the end.
 
     Raises
     ------
@@ -66,7 +66,7 @@ class Publisher:
         self.close()
 
     def wait_for_subscriber(self, timeout_s: float) -> bool:
-        """Wait for the first subscriber; False if there is none in time."""
+        """Wait for the first subscriber; return False on timeout."""
         deadline_s = time.monotonic() + timeout_s
         while not self._has_subscriber and self._socket.poll(
             max(0, int((deadline_s - time.monotonic()) * 1000))
@@ -80,45 +80,45 @@ class Publisher:
         Parameters
         ----------
         frames
-            Of the message.
+            Frames of the message.
         last
-            It is the end, for which readers wait: `close` repeats it until no subscriber is left.
+            Whether this is the end of the stream, which `close` repeats until no subscriber is left.
         """
         self._last = frames if last else None
         self._socket.send_multipart(frames)
 
     def close(self) -> None:
-        """Deliver what is queued and the end, if there was one, within the time for that, and close."""
+        """Deliver queued messages and the end, if any, within ``linger_ms``, and close."""
         deadline_s = time.monotonic() + self._linger_ms / 1000
         while self._last is not None:
             while self._socket.poll(0):
                 self._read_subscription()
             if not self._has_subscriber or time.monotonic() >= deadline_s:
                 break
-            self._socket.send_multipart(self._last)  # a slow reader has missed it, as any other message
+            self._socket.send_multipart(self._last)  # in case a slow reader has missed it
             self._socket.poll(_REPEAT_MS)
         self._socket.close()
         self._context.term()
 
     def _read_subscription(self) -> None:
-        """Note that the first subscriber has come, or the last one has gone."""
+        """Record the arrival of the first subscriber, or the departure of the last one."""
         self._has_subscriber = self._socket.recv()[:1] == b"\1"
 
 
 class Subscriber:
-    """Receives everything that a publisher sends from now on.
+    """Subscriber to all messages that a publisher sends from now on.
 
     Parameters
     ----------
     endpoint
-        The publisher's address; it need not be there yet.
+        Address of the publisher, which need not run yet.
     queue
-        How many messages may wait here until they are received.
+        Largest number of messages queued here.
 
     Raises
     ------
     BadRequest
-        The address makes no sense.
+        The address is invalid.
     """
 
     def __init__(self, endpoint: str, *, queue: int) -> None:
@@ -147,11 +147,11 @@ class Subscriber:
         return bool(self._socket.closed)
 
     def poll(self, timeout_ms: int) -> bool:
-        """Wait until there is a message to receive; False if there was none in time."""
+        """Wait for a message; return False on timeout."""
         return bool(self._socket.poll(timeout_ms))
 
     def receive(self) -> list[bytes]:
-        """Return the frames of the next message, when it has come."""
+        """Wait for the next message, and return its frames."""
         return self._socket.recv_multipart()
 
     def close(self) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Removes from a live scan what the map explains, and leaves what moved."""
+"""Removes the points of a live scan that the map explains, and keeps moving objects."""
 
 from __future__ import annotations
 

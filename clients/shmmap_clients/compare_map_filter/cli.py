@@ -93,7 +93,7 @@ def _add_rule_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _rule_from(args: argparse.Namespace) -> CompareRule:
-    """Return the rule that the options ask for."""
+    """Return the rule of the options."""
     from shmmap_clients.compare_map_filter.rule import CompareRule
 
     return CompareRule(args.mode, args.distance, args.z_ratio)
@@ -162,7 +162,7 @@ def _follow(args: argparse.Namespace) -> int:
     from shmmap_clients.streams import is_endpoint
 
     rule = _rule_from(args)
-    compare = CompareMapFilter(rule, backend=args.backend)  # compiles before any scan waits
+    compare = CompareMapFilter(rule, backend=args.backend)  # compile before the first scan
     statistics, view = DriveStatistics(), TopView()
     wait_s = args.wait if args.wait is not None else (None if is_endpoint(args.scans) else 30.0)
     with ExitStack() as stack:
@@ -256,7 +256,7 @@ def _add_apply(subparsers: Any) -> None:
 
 
 def _apply(args: argparse.Namespace) -> int:
-    """Filter and print."""
+    """Filter the files, and print the results."""
     from pathlib import Path
 
     import numpy as np
@@ -315,7 +315,7 @@ def _add_warmup(subparsers: Any) -> None:
 
 
 def _warmup(args: argparse.Namespace) -> int:
-    """Import the kernel: it is compiled for its types by that."""
+    """Import the kernel, which compiles it for all its types."""
     import time
 
     del args

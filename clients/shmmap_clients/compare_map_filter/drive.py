@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A drive: what the map around each scan does not explain, with counts and times of all of them."""
+"""A drive: points of each scan that the map does not explain, with counts and times over all scans."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ __all__ = ["ComparedScan", "DriveStatistics", "ScanComparer"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ComparedScan:
-    """A scan and what came of it.
+    """A scan and its comparison with the map.
 
     Attributes
     ----------
     scan, comparison
-        The scan, sensor frame, and which of its points are kept.
+        The scan, sensor frame, and the result with its kept points.
     missing
-        What of the window was not there when it was compared, in words; empty where it was complete.
+        Description of the window's cells missing during the comparison; empty if it was complete.
     """
 
     scan: Scan
@@ -35,16 +35,16 @@ class ComparedScan:
 
 
 class ScanComparer:
-    """Compares scan after scan with the window around its pose.
+    """Comparer of scans with the window around their poses.
 
     Parameters
     ----------
     window
-        Of the rule's layer.
+        Window of the rule's layer.
     compare
-        What compares.
+        Filter that compares.
     first_wait_s, wait_s
-        How long the first scan and each later one may wait for the window's cells; None: not at all.
+        Time that the first scan and each later one may wait for the window's cells, seconds; None: no wait.
     """
 
     def __init__(
@@ -61,14 +61,14 @@ class ScanComparer:
         Raises
         ------
         BadRequest
-            It has no pose.
+            The scan has no pose.
         ShmmapError
-            The daemon cannot be asked, and no cell was ever there.
+            The daemon cannot be reached, and there has been no cell yet.
         """
         T = scan.pose
         update = self._window.move_to(float(T[0, 3]), float(T[1, 3]), wait=self._wait_s)
         error = self._window.error
-        # all from one state of the window: it may ask again while the scan is compared
+        # use one state of the window, which may change during the comparison
         cells = (*update.added, *update.kept, *update.changed)
         if error is not None and not cells:
             raise error
@@ -86,7 +86,7 @@ def _missing(update: WindowUpdate, error: ShmmapError | None) -> str:
 
 
 class DriveStatistics:
-    """Sums over the scans of a drive; its size does not depend on how many."""
+    """Running statistics of a drive's scans, in constant memory."""
 
     def __init__(self) -> None:
         self.scans = 0
@@ -113,7 +113,7 @@ class DriveStatistics:
             self._update_ms.add(comparison.update_s * 1e3)
 
     def line(self, compared: ComparedScan) -> str:
-        """One line about the latest scan."""
+        """Return one line about the latest scan."""
         comparison = compared.comparison
         points, kept = len(comparison.kept), int(np.count_nonzero(comparison.kept))
         return (
@@ -124,7 +124,7 @@ class DriveStatistics:
         )
 
     def document(self, compared: ComparedScan) -> dict[str, Any]:
-        """Return what ``--json-lines`` writes about one scan."""
+        """Return the JSON object that ``--json-lines`` writes for one scan."""
         comparison = compared.comparison
         return {
             "name": compared.scan.name,
@@ -139,7 +139,7 @@ class DriveStatistics:
         }
 
     def summary(self) -> dict[str, Any]:
-        """Return what ``--json`` prints; times in milliseconds, null without a scan."""
+        """Return the JSON object that ``--json`` prints; times in milliseconds, null without a scan."""
         return {
             "scans": self.scans,
             "points": self.points,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The filter itself: a rule, the cells around, and a scan in; what the map does not explain out."""
+"""The filter: from a rule, cells and a scan, it finds the points that the map does not explain."""
 
 from __future__ import annotations
 
@@ -23,20 +23,19 @@ BACKENDS = ("numba", "numpy")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Comparison:
-    """What came of one scan.
+    """Result of the comparison of one scan.
 
     Attributes
     ----------
     kept
-        (N,) bool: points that the map does not explain; those not finite among them, as upstream.
+        (N,) bool: points that the map does not explain, including those not finite, as upstream.
     cells
-        How many cells there were to look into.
+        Number of cells in the comparison.
     no_map
-        No cell reaches where the scan is: all its points are kept because there was no map, not because
-        something has changed.
+        Whether no cell reaches the scan, so that all points are kept for lack of a map.
     compare_s, update_s
-        Seconds for the comparison, and for taking over the window's cells before it (0 where the
-        window had not changed).
+        Seconds for the comparison, and for updating the window's cells before it (0 if the window had not
+        changed).
     """
 
     kept: NDArray[np.bool_]
@@ -56,7 +55,7 @@ class Comparison:
 
 
 class CompareMapFilter:
-    """Says which points of a scan the map explains.
+    """Filter that finds the points of a scan that the map explains.
 
     Follow a window of the layer that the rule needs (`CompareRule.layer`)::
 
@@ -66,13 +65,13 @@ class CompareMapFilter:
         window.move_to(x, y, wait=5.0)
         moved = compare.follow(window).apply(xyz, T_map_sensor).kept
 
-    Nothing is copied from the cells and nothing built over them: an update makes a table of their
+    The filter neither copies cells nor builds an index over them: an update only makes a table of their
     addresses.
 
     Parameters
     ----------
     rule
-        What counts as explained.
+        Rule that defines explained points.
     backend
         ``numba``, or ``numpy``: the same result, slower.
 
@@ -97,7 +96,7 @@ class CompareMapFilter:
             self._explain = kernel.explain
 
     def follow(self, window: MapWindow) -> CompareMapFilter:
-        """Take the cells of a window as it is now; nothing to do where it has not changed.
+        """Use the present cells of a window; do nothing if it has not changed.
 
         Raises
         ------
@@ -138,7 +137,7 @@ class CompareMapFilter:
 
     def _use(self, cells: dict[int, SearchCell]) -> None:
         leaves = {cell.leaf for cell in cells.values()} - {self.rule.distance}
-        if leaves:  # its columns would not hold the neighbours
+        if leaves:  # else its columns would not contain the neighbours
             raise BadRequest(
                 f"a search layer of {leaves.pop():g} m cannot answer a distance of {self.rule.distance:g} m",
                 hint=f"this rule needs {self._layer}",
@@ -159,7 +158,7 @@ class CompareMapFilter:
         Raises
         ------
         BadRequest
-            The arrays have other shapes.
+            An array has a wrong shape.
         """
         pose = np.eye(4) if T_map_sensor is None else np.ascontiguousarray(T_map_sensor, np.float64)
         if pose.shape != (4, 4):
@@ -180,11 +179,11 @@ class CompareMapFilter:
 
     @property
     def bounds(self) -> tuple[float, float, float, float] | None:
-        """Where the cells are: min_x, min_y, max_x, max_y, metres, map frame; None without any."""
+        """Bounds of the cells: min_x, min_y, max_x, max_y, metres, map frame; None without cells."""
         return self._table.bounds
 
     def _reached(self, scan: NDArray[Any], pose: NDArray[np.float64]) -> bool:
-        """Whether a cell has columns where the scan is; an empty scan is everywhere."""
+        """Return whether a cell has columns within the scan's extent; True for an empty scan."""
         places = to_map(scan, pose)[:, :2]
         places = places[np.isfinite(places).all(axis=1)]
         if not len(places):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The compiled comparison: one thread, no interpreter lock, straight from shared memory.
+"""The compiled comparison: one thread, without the GIL, directly on shared memory.
 
-Importing this module compiles the kernel, or loads it from numba's cache (tenths of a second).
+Importing this module compiles the kernel, or loads it from numba's cache within tenths of a second.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def _coordinate(address: Any, double: Any, index: Any) -> Any:
 
 @numba.njit(inline="always")
 def _first_above(address: Any, double: Any, begin: Any, end: Any, z: Any) -> Any:
-    """First row of ``begin`` to ``end`` whose z is at least ``z``, by bisection."""
+    """Return the first row of ``begin`` to ``end`` whose z is at least ``z``, by bisection."""
     while begin < end:
         middle = (begin + end) >> 1
         if _coordinate(address, double, 3 * middle + 2) < z:
@@ -85,7 +85,7 @@ def explain(  # noqa: C901  its parts would take a dozen arguments each
     bin_cells: Any,
     explained: Any,
 ) -> None:
-    """Say of each point whether the map explains it; see `rule.explain`, which this equals."""
+    """Write for each point whether the map explains it; equal to `rule.explain`."""
     inverse = 1.0 / leaf
     inverse_z = 1.0 / d_z
     reach = d + SLACK
@@ -124,7 +124,7 @@ def explain(  # noqa: C901  its parts would take a dozen arguments each
             if from_x > to_x or from_y > to_y:
                 continue
             address, double = rows[cell, ADDRESS_XYZ], rows[cell, IS_DOUBLE] != 0
-            # its own column first: most points of a scan are explained there
+            # own column first, which explains most points of a scan
             width = to_x - from_x + 1
             columns = width * (to_y - from_y + 1)
             own = -1

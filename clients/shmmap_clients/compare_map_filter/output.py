@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where filtered scans go: PCD files in a directory, a ZeroMQ publisher, and a picture from above."""
+"""Outputs of filtered scans: PCD files in a directory, a ZeroMQ publisher, and a picture from above."""
 
 from __future__ import annotations
 
@@ -20,29 +20,29 @@ from shmmap_clients.streams import is_endpoint
 
 __all__ = ["Output", "PcdDirectory", "Stream", "TopView", "open_output"]
 
-_SIDE_PX: Final = 1200.0  # of the picture, at most
+_SIDE_PX: Final = 1200.0  # longest side of the picture
 _MARGIN: Final = 2.0  # metres
 _REMOVED: Final = (178, 186, 194, 255)
 _KEPT: Final = (214, 40, 40, 255)
 _DRIVE: Final = "#1c7ed6"
-_MOST: Final = 1 << 20  # pixels that are remembered before they are made twice as large
-_OFFSET: Final = 1 << 30  # makes indices positive; two of them fit one int64
+_MOST: Final = 1 << 20  # pixels kept before their side is doubled
+_OFFSET: Final = 1 << 30  # makes indices positive, so that two fit into one int64
 
 
 class Output(Protocol):
-    """Takes scans; `close` ends it."""
+    """Receiver of scans, until `close`."""
 
     def write(self, compared: ComparedScan) -> None:
-        """Take a scan."""
+        """Write a scan."""
 
     def close(self) -> None:
-        """Finish: no more scans come."""
+        """Finish after the last scan."""
 
 
 def _columns(compared: ComparedScan, mask: bool) -> dict[str, NDArray[Any]]:
-    """All points with a column ``kept``, or the kept ones with a column ``index``: their rows in the scan.
+    """Return all points with a column ``kept``, or the kept points with a column ``index``.
 
-    Those rows count the points that were left out before the comparison, too.
+    The index is the row in the original scan, including points left out before the comparison.
     """
     columns, comparison, rows = compared.scan.columns, compared.comparison, compared.scan.rows
     if mask:
@@ -52,19 +52,19 @@ def _columns(compared: ComparedScan, mask: bool) -> dict[str, NDArray[Any]]:
 
 
 class PcdDirectory:
-    """Writes ``NAME.pcd`` for each scan, sensor frame, the pose as the file's viewpoint.
+    """Writer of ``NAME.pcd`` for each scan, sensor frame, with the pose as the file's viewpoint.
 
     Parameters
     ----------
     directory
-        Made if missing; files of the same name are replaced.
+        Directory, created if missing; files of the same name are replaced.
     mask
-        All points and a column ``kept``, instead of the kept ones and a column ``index``.
+        Whether to write all points with a column ``kept``, not only the kept ones with a column ``index``.
 
     Raises
     ------
     OSError
-        The directory cannot be made; later, a file cannot be written.
+        The directory cannot be created; later, a file cannot be written.
     """
 
     def __init__(self, directory: Path, *, mask: bool) -> None:
@@ -81,11 +81,11 @@ class PcdDirectory:
         write_pcd(path, _columns(compared, self._mask), viewpoint=viewpoint)
 
     def close(self) -> None:
-        """Nothing to do: every file is complete."""
+        """Do nothing: every file is complete."""
 
 
 class Stream:
-    """Publishes each scan; see `shmmap_clients.scans.scan_stream`.
+    """Publisher of each scan; see `shmmap_clients.scans.scan_stream`.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ class Stream:
     mask
         As in `PcdDirectory`.
     wait_s
-        How long to wait for the first subscriber.
+        Timeout of the wait for the first subscriber, seconds.
     """
 
     def __init__(self, endpoint: str, *, mask: bool, wait_s: float) -> None:
@@ -123,12 +123,12 @@ def open_output(target: str, *, mask: bool, wait_s: float) -> Output:
 
 
 class TopView:
-    """Collects which pixels of the ground have kept and which have removed points.
+    """Picture of the ground pixels with kept and with removed points.
 
     Parameters
     ----------
     pixel
-        Side of a pixel, metres; the picture is made coarser where it would be too large.
+        Side of a pixel, metres; it is doubled when the picture becomes too large.
     """
 
     def __init__(self, pixel: float = 0.1) -> None:
@@ -139,7 +139,7 @@ class TopView:
         self._path: Decimated[tuple[float, float]] = Decimated()
 
     def add(self, xyz: NDArray[Any], kept: NDArray[np.bool_], position: tuple[float, float]) -> None:
-        """Add a scan: (N, 3) and (N,), metres, map frame; and where it was taken."""
+        """Add a scan: (N, 3) and (N,), metres, map frame; and its position."""
         places = np.floor(xyz[:, :2].astype(np.float64) / self._pixel)
         finite = np.isfinite(places).all(axis=1) & (np.abs(places) < self._offset).all(axis=1)
         index = places[finite].astype(np.int64) + self._offset
@@ -152,7 +152,7 @@ class TopView:
             self._coarsen()
 
     def _coarsen(self) -> None:
-        """Make pixels twice as large: memory does not grow with the length of the drive."""
+        """Double the side of pixels, so that memory does not grow with the length of the drive."""
         self._pixel *= 2
         self._offset //= 2
         self._kept, self._removed = (

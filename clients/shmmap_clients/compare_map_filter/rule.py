@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""When the map explains a point: Autoware's three rules, with the layers that answer them.
+r"""Rules by which the map explains a point: Autoware's three rules, and their layers.
 
 The rules are those of autoware_compare_map_segmentation, in float64 and across cell borders:
 
 ``voxel``
     A voxel of d x d x d·ratio, the point's own or one of the 26 around it, has a centroid c with
-    \|c - p\| < d along x, < d along y and < d·ratio along z.  A voxel that a border of two cells cuts has
-    a centroid in each of them, and either counts.  (A centroid that near cannot lie in any other
-    voxel, so the rule is that one exists.)
+    \|c - p\| < d along x, < d along y and < d·ratio along z.  A voxel on the border of two cells
+    has a centroid in each cell, and either counts.  (No other voxel can have a centroid that near, so the
+    rule is that such a centroid exists.)
 ``voxel-distance``
-    The point's own voxel has a map point, or one lies within d.
+    The point's own voxel contains a map point, or a map point lies within d.
 ``distance``
     A map point lies within d (Euclidean, closed).
 
-A point that is not finite is not explained by anything.  `explain` is the comparison in numpy: for machines
-without a compiler, and to check the compiled kernel against.
+A point that is not finite is never explained.  `explain` is the comparison in numpy, for machines without
+numba, and as a reference for the compiled kernel.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ __all__ = ["DISTANCE", "MODES", "SLACK", "VOXEL", "VOXEL_DISTANCE", "CompareRule
 MODES: Final = ("voxel", "voxel-distance", "distance")
 VOXEL, VOXEL_DISTANCE, DISTANCE = range(3)
 SLACK: Final = 1e-6
-"""Metres by which more is looked at than can count: what rounding may hide (the rule itself decides)."""
+"""Margin of the search for candidates, metres, against rounding; the rule itself decides."""
 _PAIRS: Final = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
 class CompareRule:
-    """Which rule, and its distances.
+    """A rule and its distances.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class CompareRule:
     distance
         d, metres (Autoware's ``distance_threshold``).
     z_ratio
-        Height of a voxel over d (``downsize_ratio_z_axis``); of no account in ``distance``.
+        Height of a voxel over d (``downsize_ratio_z_axis``); ignored by ``distance``.
 
     Raises
     ------
@@ -81,7 +81,7 @@ class CompareRule:
 
     @property
     def layer(self) -> str:
-        """Layer that answers this rule; see `shmmap.layers.ground`."""
+        """Layer for this rule; see `shmmap.layers.ground`."""
         d = self.distance
         if self.mode == "voxel":
             return f"search(leaf={d!r},of=voxel(leaf_x={d!r},leaf_y={d!r},leaf_z={self.distance_z!r}))"
@@ -89,7 +89,7 @@ class CompareRule:
 
 
 def to_map(points: NDArray[Any], T_map_sensor: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points of a scan, (N, 3), in the map frame, float64, summed in the compiled path's order."""
+    """Return a scan's points, (N, 3) float64, in the map frame, with the compiled kernel's order of sums."""
     x, y, z = (points[:, axis].astype(np.float64) for axis in range(3))
     T = T_map_sensor
     return np.stack([T[row, 0] * x + T[row, 1] * y + T[row, 2] * z + T[row, 3] for row in range(3)], axis=1)
@@ -98,7 +98,7 @@ def to_map(points: NDArray[Any], T_map_sensor: NDArray[np.float64]) -> NDArray[n
 def explain(
     points: NDArray[Any], T_map_sensor: NDArray[np.float64], rule: CompareRule, table: SearchTable
 ) -> NDArray[np.bool_]:
-    """Say of each point whether the map explains it.
+    """Return for each point whether the map explains it.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def explain(
     T_map_sensor
         (4, 4) float64.
     rule, table
-        What counts, and where to look.
+        Rule, and table of the cells.
 
     Returns
     -------
@@ -152,7 +152,7 @@ def _in_column(
     own: NDArray[np.int64],
     rule: CompareRule,
 ) -> NDArray[np.bool_]:
-    """Whether each place is explained by a point of the column named beside it."""
+    """Return whether each position is explained by a point of its given column."""
     right, up = (column - np.array(cell.first)).T
     tile = cell.tile[up // TILE_COLUMNS, right // TILE_COLUMNS].astype(np.int64)
     at = tile * TILE_COLUMNS**2 + up % TILE_COLUMNS * TILE_COLUMNS + right % TILE_COLUMNS
@@ -162,7 +162,7 @@ def _in_column(
     which = np.flatnonzero(count)
     ends = np.cumsum(count[which])
     first = 0
-    while first < len(which):  # every pair of place and point, a million at a time
+    while first < len(which):  # all pairs of position and point, a million at a time
         before = int(ends[first - 1]) if first else 0
         last = max(int(np.searchsorted(ends, before + _PAIRS, side="right")), first + 1)
         part = which[first:last]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ``search`` layers of cells, as this process sees them: views, and a table of where they lie."""
+"""The ``search`` layers of cells in this process: views, and a table of their addresses."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ __all__ = [
     "SearchTable",
 ]
 
-TILE_COLUMNS = 8  # as `shmmap.layers.ground` has them: 8 x 8 columns in a tile
+TILE_COLUMNS = 8  # as in `shmmap.layers.ground`: 8 x 8 columns in a tile
 _MAX_BINS: Final = 1 << 16
-_REACH_COLUMNS: Final = 2  # a place's neighbours within one leaf, and what rounding adds
-# what lies where in a row of the table
+_REACH_COLUMNS: Final = 2  # columns of neighbours within one leaf, and a margin for rounding
+# indices of values in a row of the table
 ADDRESS_XYZ, ADDRESS_TILE, ADDRESS_START, TILES_X, TILES_Y, FIRST_X, FIRST_Y, IS_DOUBLE = range(8)
 
 
@@ -51,7 +51,7 @@ class SearchCell:
     xyz
         (N, 3) float32 or float64, map frame, metres: by tile, column, then z.
     tile
-        (tiles_y, tiles_x) int32: number of each tile, -1 where it has no points.
+        (tiles_y, tiles_x) int32: number of each tile, -1 for a tile without points.
     start
         (tiles * 64 + 1,) int32: first row of each column.
     leaf
@@ -59,7 +59,7 @@ class SearchCell:
     first
         First column along x and y, counted in columns from the map's origin.
     owner
-        Whatever keeps the memory mapped.
+        Object that keeps the memory mapped.
     """
 
     xyz: NDArray[Any]
@@ -76,7 +76,7 @@ class SearchCell:
         Raises
         ------
         BadRequest
-            They are not those of a ``search`` layer.
+            The columns are not those of a ``search`` layer.
         """
         missing = [name for name in ("xyz", "tile", "start") if name not in columns]
         if missing:
@@ -95,12 +95,12 @@ class SearchCell:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SearchTable:
-    """A private table of base addresses, and a coarse grid that says which cells are near a column.
+    """Private table of base addresses, and a coarse grid that finds the cells near a column.
 
     Attributes
     ----------
     cells
-        The cells; the table is good as long as it is kept, since they keep the memory mapped.
+        The cells, which keep the memory mapped while the table exists.
     rows
         (C, 8) int64: addresses of ``xyz``, ``tile`` and ``start``; tiles along x and y; first column
         along x and y; whether ``xyz`` is float64.
@@ -109,7 +109,7 @@ class SearchTable:
     bin_columns, bin_first, bin_shape
         The grid: columns in a bin, first bin along x and y, bins along x and y.
     bin_start, bin_cells
-        (bins + 1,) and (entries,) int32: the cells of each bin, those within a leaf of it included.
+        (bins + 1,) and (entries,) int32: the cells of each bin, including cells within a leaf of it.
     """
 
     cells: tuple[SearchCell, ...]
@@ -123,7 +123,7 @@ class SearchTable:
 
     @property
     def bounds(self) -> tuple[float, float, float, float] | None:
-        """Around all columns: min_x, min_y, max_x, max_y, metres; None without any cell."""
+        """Bounds of all columns: min_x, min_y, max_x, max_y, metres; None without cells."""
         if not self.cells:
             return None
         low = np.array([cell.first for cell in self.cells]).min(axis=0) * self.leaf
@@ -131,14 +131,14 @@ class SearchTable:
         return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 
     def touches(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> bool:
-        """Whether a cell has columns in the rectangle from ``low`` to ``high``, (2,) each, metres."""
+        """Return whether a cell has columns in the rectangle from ``low`` to ``high``, (2,) each, metres."""
         first = np.array([cell.first for cell in self.cells]).reshape(-1, 2) * self.leaf
         end = np.array([cell.columns_end for cell in self.cells]).reshape(-1, 2) * self.leaf
         return bool(((first <= high) & (end >= low)).all(axis=1).any())
 
     @classmethod
     def of_cells(cls, given: Sequence[SearchCell]) -> SearchTable:
-        """Make the table of cells, all of one ``leaf``; empty ones are left out."""
+        """Make the table of cells, all of one ``leaf``, without empty cells."""
         cells = tuple(cell for cell in given if len(cell.xyz))
         nothing = np.zeros(1, np.int32)
         if not cells:
@@ -160,7 +160,7 @@ class SearchTable:
         )
         low = np.array([cell.first for cell in cells], np.int64) - _REACH_COLUMNS
         high = np.array([cell.columns_end for cell in cells], np.int64) + _REACH_COLUMNS
-        # about a cell in each bin, and never more bins than a cache holds
+        # about one cell in each bin, and at most as many bins as fit into a cache
         span = high.max(axis=0) - low.min(axis=0)
         wide = max(1, int(np.median(high - low)))
         while (span[0] // wide + 2) * (span[1] // wide + 2) > _MAX_BINS:

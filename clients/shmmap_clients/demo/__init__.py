@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What demonstrations and checks need of the programs: a picture, a scene."""
+"""Parts of the programs for demonstrations and checks."""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``python -m shmmap_clients.demo.live_picture``: what ``shmmap demo --live`` starts to draw its map.
+"""``python -m shmmap_clients.demo.live_picture``: drawing program of ``shmmap demo --live``.
 
-As the picture of ``shmmap-rolling``, with the voxels that are on disk alone, too.
+Like the picture of ``shmmap-rolling``, but including voxels that are only on disk.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The height of the ground over a whole map, in the memory of one cell; and around a moving vehicle."""
+"""Heights of the ground: of a whole map, in the memory of one cell, and around a moving vehicle."""
 
 from __future__ import annotations
 

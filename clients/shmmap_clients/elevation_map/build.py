@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The whole map, one cell at a time: list, load by id, reduce to columns, release."""
+"""Elevation of the whole map, one cell at a time: list, load by id, reduce to columns, release."""
 
 from __future__ import annotations
 
@@ -36,27 +36,27 @@ __all__ = [
     "far_cells",
 ]
 
-_APART_M: Final = 1000.0  # cells nearer than about that are in one part of a map
-_SHARE: Final = 0.01  # of the map's bytes: a part that has more is no stray point
+_APART_M: Final = 1000.0  # cells nearer than about this distance are in one part of the map
+_SHARE: Final = 0.01  # share of the map's bytes: a larger part is not a stray point
 _FEW_BYTES: Final = 4096
-_LARGER: Final = 4.0  # times: where the box does not grow by that much, nothing is left out
+_LARGER: Final = 4.0  # factor: unless the box grows by more, nothing is left out
 _MIN, _MAX, _MEAN, _COUNT = range(4)
 FORMAT: Final = 3
 _EVERY: Final = 64  # cells between checkpoints
 
 
 def far_cells(boxes: NDArray[np.float64], sizes: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return how far each cell lies from the map, where it is alone and holds next to nothing; else 0.
+    """Return the distance of each nearly empty outlying cell from the map; 0 for all other cells.
 
-    A stray point or two make such a cell.  A grid covers the box around its cells: one point kilometres off
-    would make it a thousand times as large.
+    A stray point or two can create such a cell.  A grid covers the box around its cells, and one point
+    kilometres off would make it a thousand times as large.
 
     Parameters
     ----------
     boxes
         (N, 4) float64: min_x, min_y, max_x, max_y, metres.
     sizes
-        (N,) int64: bytes of their sources.
+        (N,) int64: bytes of the cells' sources.
 
     Returns
     -------
@@ -77,13 +77,13 @@ def far_cells(boxes: NDArray[np.float64], sizes: NDArray[np.int64]) -> NDArray[n
 
 
 def _extent(boxes: NDArray[np.float64]) -> float:
-    """Return the area of the box around boxes, square metres; a line is a metre wide."""
+    """Return the area of the box around boxes, square metres; a line counts as a metre wide."""
     sides = boxes[:, 2:].max(axis=0) - boxes[:, :2].min(axis=0)
     return float(np.maximum(sides, 1.0).prod())
 
 
 def _parts(boxes: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the part of the map that each cell is in, counted from 0: squares that touch are one part."""
+    """Return the number of the map part of each cell, from 0; squares that touch are one part."""
     edge = max(_APART_M, float((boxes[:, 2:] - boxes[:, :2]).max()))
     squares, member = np.unique(
         np.floor((boxes[:, :2] + boxes[:, 2:]) / (2 * edge)).astype(np.int64), axis=0, return_inverse=True
@@ -108,7 +108,7 @@ def _parts(boxes: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def _columns_of(cell: Cell, rule: ElevationRule) -> Columns:
-    """Points of a cell, (N, 3); or of its ``elevation`` layer min, max, mean and count, (N, 4) float64."""
+    """Return a cell's points, (N, 3), or its ``elevation`` layer: min, max, mean, count, (N, 4) float64."""
     if rule.name == "surface":
         xyz = cell.xyz if not any(cell.origin) else cell.xyz.astype(np.float64) + cell.origin
         index = np.floor(xyz[:, :2].astype(np.float64) * (1.0 / rule.resolution)).astype(np.int64)
@@ -126,7 +126,7 @@ def _columns_of(cell: Cell, rule: ElevationRule) -> Columns:
 def _heights_of(
     rows: Columns, rule: ElevationRule
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Columns i and j, (M,), and the height of each, (M,) float64 metres, from all their rows."""
+    """Return columns i and j, (M,), and their heights, (M,) float64 metres, from all their rows."""
     low_i, low_j = int(rows.i.min()), int(rows.j.min())
     width = int(rows.i.max()) - low_i + 1
     key = (rows.j - low_j) * width + (rows.i - low_i)
@@ -149,7 +149,7 @@ def _heights_of(
 
 @dataclass(slots=True)
 class Checkpoint:
-    """Cells done, in order; rows read; points outside their cell; columns that had a point."""
+    """Counts at a checkpoint: cells done, rows read, points outside their cell, columns with a point."""
 
     done: int = 0
     rows: int = 0
@@ -158,11 +158,11 @@ class Checkpoint:
 
 
 class Journal:
-    """Keeps the latest checkpoint of a build in its directory.
+    """Storage of a build's latest checkpoint, in its directory.
 
-    Heights and ``seams-N.npz`` are forced to the disk first, then ``state.json`` with N appears by rename:
-    whenever a build or its machine dies, the state speaks of what is there whole.  Columns finished after a
-    checkpoint are made again, with the same heights.
+    Heights and ``seams-N.npz`` are synced to the disk first, then ``state.json`` with N appears by rename.
+    So whenever a build or its machine stops, the state refers to complete files.  Columns finished after a
+    checkpoint are computed again, with the same heights.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -188,7 +188,7 @@ class Journal:
                 path.unlink()
 
     def read(self, seams: Seams) -> Checkpoint | None:
-        """Return the latest checkpoint and fill ``seams`` from it; None where there is no good one."""
+        """Return the latest checkpoint and fill ``seams`` from it; None if there is no valid one."""
         try:
             state = Checkpoint(**json.loads((self._directory / "state.json").read_text(encoding="utf-8")))
             with np.load(self._directory / f"seams-{state.done}.npz", allow_pickle=False) as archive:
@@ -208,7 +208,7 @@ class Journal:
 
 
 class MapChanged(ShmmapError):
-    """The map changed while its elevation was being made: begin again."""
+    """The map changed during the build, which must begin again."""
 
     code = "map_changed"
     exit_code = 75
@@ -232,20 +232,19 @@ class BuiltElevation:
     grid
         The heights.
     map_version
-        State of the map that it is of.
+        Version of the map that was used.
     cells
-        Cells of the map.
+        Number of cells of the map.
     loaded
-        Of those, how many this call had to load: 0 where the cache had it all.
+        Number of cells that this call loaded; 0 if the cache had the whole elevation.
     occupied
-        Columns with a point; in the ``surface`` rule not all of them have a height.
+        Number of columns with a point; under the ``surface`` rule not all of them have a height.
     stray
-        Points left out because they lie outside the box of their cell.
+        Number of points left out because they lie outside the box of their cell.
     failed
-        Cells that could not be loaded; what they hold is missing.
+        Cells that could not be loaded, and whose points are missing.
     far
-        Ids of cells that were left out, for they lie far from all others and hold next to nothing, and how
-        far, metres.
+        Cells left out because they are nearly empty and far from all others: id and distance, metres.
     """
 
     grid: ElevationGrid
@@ -272,20 +271,20 @@ def build_elevation_map(
     wait_s: float = 60.0,
     progress: Callable[[BuildProgress], None] | None = None,
 ) -> BuiltElevation:
-    """Return the elevation of the daemon's whole map; made only where the cache does not have it.
+    """Return the elevation of the daemon's whole map, from the cache or by a build.
 
-    A build that was interrupted continues from its last checkpoint.
+    An interrupted build continues from its last checkpoint.
 
     Parameters
     ----------
     client
-        Of the daemon.
+        Client of the daemon.
     rule
-        What a height is.
+        Definition of heights.
     cache
-        Directory; each map and rule has its own inside.
+        Directory, with a subdirectory for each map and rule.
     wait_s
-        How long one cell may take.
+        Time for one cell to load, seconds.
     progress
         Called after each cell.
 
@@ -294,11 +293,11 @@ def build_elevation_map(
     MapMissing
         The map has no cells.
     MapChanged
-        It changed meanwhile.
+        The map changed during the build.
     LoadTimeout
-        A cell was not there in time.
+        A cell was not loaded in time.
     InstanceBusy
-        Another run is making the same elevation in this cache.
+        Another run is building the same elevation in this cache.
     """
     listing = client.metadata()
     if not len(listing):
@@ -309,7 +308,7 @@ def build_elevation_map(
 
 @contextlib.contextmanager
 def _alone(cache: Path, key: str) -> Iterator[Path]:
-    """Hold a directory of the cache: two runs at a time would write over each other's heights."""
+    """Lock a directory of the cache, since concurrent runs would overwrite each other's heights."""
     cache.mkdir(parents=True, exist_ok=True)
     with open(cache / f"{key}.lock", "wb") as file:
         try:
@@ -329,7 +328,7 @@ def _build(
     wait_s: float,
     progress: Callable[[BuildProgress], None] | None,
 ) -> BuiltElevation:
-    # row after row: only the strip between two rows has to wait
+    # row after row, so that only the strip between two rows has to wait
     metres = listing.boxes
     away = far_cells(metres, np.array([info.source_bytes for info in listing], np.int64))
     far = tuple((listing[n].id, float(away[n])) for n in np.flatnonzero(away).tolist())
@@ -382,7 +381,7 @@ def _build(
 def _load(
     client: Client, info: CellInfo, layer: str, wait_s: float, failed: list[CellError], map_version: int
 ) -> Cell | None:
-    """Load a cell as of the map version that was listed; None, and a row in ``failed``, if that fails."""
+    """Load a cell in the listed map version; on failure, append to ``failed`` and return None."""
     answer = client.selected((info.id,), layer, wait=wait_s, strict=None)
     if answer.failed:
         failed += answer.failed

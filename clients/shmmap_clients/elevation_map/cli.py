@@ -42,7 +42,7 @@ __all__ = ["main"]
 
 _ATTEMPTS = 3
 _EVERY_S = 0.5
-_NAMED: Final = 5  # of the cells that were left out
+_NAMED: Final = 5  # number of omitted cells that are named
 _NAME: Final = "shmmap-elevation"
 _FEW: Final = 0.5
 """Share of the columns with points that should have a height; a map of sparse points has fewer."""
@@ -104,7 +104,7 @@ def _add_build(subparsers: Any) -> None:
 
 
 def _add_height_options(parser: argparse.ArgumentParser) -> None:
-    """Add what the height of a column is."""
+    """Add the options that define the height of a column."""
     rule = parser.add_argument_group("heights")
     rule.add_argument(
         "--rule",
@@ -147,7 +147,7 @@ def _add_height_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _build(args: argparse.Namespace) -> int:
-    """Build and write."""
+    """Build the elevation map, and write it."""
     import numpy as np
 
     from shmmap import BadRequest
@@ -202,7 +202,7 @@ def _build(args: argparse.Namespace) -> int:
 def _built(
     args: argparse.Namespace, client: Client, rule: ElevationRule, progress: Callable[[BuildProgress], None]
 ) -> BuiltElevation:
-    """Return the elevation of the whole map; where the map changes meanwhile, that of the changed one."""
+    """Return the elevation of the whole map; build again if the map changes meanwhile."""
     from shmmap_clients.elevation_map.build import MapChanged, build_elevation_map
 
     def build() -> BuiltElevation:
@@ -218,7 +218,7 @@ def _built(
 def _report(
     args: argparse.Namespace, built: BuiltElevation, measured: int, filled: int, written: list[str]
 ) -> None:
-    """Print the summary, and on stderr what is missing."""
+    """Print the summary, and report missing data on stderr."""
     grid = built.grid
     if args.json:
         summary = {
@@ -261,7 +261,7 @@ def _report(
 
 
 def _sparse(rule: ElevationRule, measured: int, occupied: int) -> str:
-    """Return that few columns have a height, why, and what helps."""
+    """Return a message that few columns have a height, with reason and remedy."""
     return (
         f"{measured} of {occupied} columns with points ({100 * measured / occupied:.1f} %) have a height;"
         f" a column of {rule.resolution:g} m needs {rule.min_points} points within {rule.tolerance:g} m of"
@@ -277,7 +277,7 @@ def _cache(named: str | None) -> Path:
 
 
 class _Progress:
-    """Shows the progress of a build now and then: cells come faster than a person reads."""
+    """Progress display of a build, at intervals, since cells are faster than a reader."""
 
     def __init__(self, line: ProgressLine, rows: str) -> None:
         self._line = line

@@ -28,8 +28,8 @@ _BLOCK_BYTES: Final = 1 << 18
 class ElevationGrid:
     """A grid of heights; row 0 is the southernmost, column 0 the westernmost.
 
-    The file holds the bits of float32, each xor the bits of NaN: so the holes of a sparse file, which
-    read as zeros, are columns without a height.
+    The file holds the bits of float32, xor the bits of NaN.  So the holes of a sparse file, which read as
+    zeros, are columns without a height.
 
     Attributes
     ----------
@@ -38,12 +38,12 @@ class ElevationGrid:
     resolution
         Edge of a column, metres.
     first
-        Index i, j of column [0, 0]: it begins at i · resolution, j · resolution.
+        Index i, j of column [0, 0], whose corner is i · resolution, j · resolution.
     shape
         Rows and columns.
     boxes
-        (N, 4) int64: columns i0, j0 up to but without i1, j1 that may have heights, any order, indices from
-        the map's origin; None: all.  What is outside of them costs next to nothing.
+        (N, 4) int64: i0, j0, i1, j1 (exclusive) of the ranges of columns that may have heights, any order,
+        indices from the map's origin; None: all.  Columns outside cost next to nothing.
     """
 
     path: Path
@@ -56,12 +56,12 @@ class ElevationGrid:
     def create(
         cls, path: Path, resolution: float, first: tuple[int, int], shape: tuple[int, int]
     ) -> ElevationGrid:
-        """Make the file, without any height; it takes no room on the disk yet.
+        """Create the file without heights; it occupies no disk space yet.
 
         Raises
         ------
         BadRequest
-            The grid is so large that something must be wrong.
+            The grid is implausibly large.
         """
         if max(shape) > _LONGEST_SIDE:
             raise BadRequest(
@@ -79,18 +79,18 @@ class ElevationGrid:
 
     @property
     def block_rows(self) -> int:
-        """How many rows are best read at a time."""
+        """Number of rows best read at a time."""
         return max(1, _BLOCK_BYTES // (4 * max(1, self.shape[1])))
 
     def put(self, i: NDArray[np.int64], j: NDArray[np.int64], heights: NDArray[np.floating]) -> None:
-        """Write heights of columns (indices from the map's origin); NaN is none."""
+        """Write heights of columns (indices from the map's origin); NaN means no height."""
         rows, columns = j - self.first[1], i - self.first[0]
         bits = heights.astype(np.float32).view(np.uint32) ^ _NAN_BITS
         bits[np.isnan(heights)] = 0
         with open(self.path, "r+b") as file:
             low, high = int(rows.min()), int(rows.max()) + 1
             left, right = int(columns.min()), int(columns.max()) + 1
-            # a block of the touched rows at a time: pread and pwrite leave no pages mapped in this process
+            # one block of the touched rows at a time; pread and pwrite map no pages into this process
             block = np.zeros((high - low, right - left), np.uint32)
             for row in range(low, high):
                 at = 4 * (row * self.shape[1] + left)
@@ -100,9 +100,9 @@ class ElevationGrid:
                 os.pwrite(file.fileno(), block[row - low].tobytes(), 4 * (row * self.shape[1] + left))
 
     def rows(self, begin: int, end: int, left: int = 0, right: int | None = None) -> NDArray[np.float32]:
-        """Rows ``begin`` to ``end`` of columns ``left`` to ``right`` (None: to the last), (n, m) float32.
+        """Return rows ``begin`` to ``end``, columns ``left`` to ``right`` (None: the last), (n, m) float32.
 
-        What is outside the grid is NaN, as are columns without a height.
+        Columns outside the grid or without a height are NaN.
         """
         right = self.shape[1] if right is None else right
         result = np.full((end - begin, right - left), np.nan, np.float32)
@@ -125,7 +125,7 @@ class ElevationGrid:
         left: int = 0,
         right: int | None = None,
     ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-        """Rows with holes filled, and what each value is.
+        """Return rows with holes filled, and the kind of each value.
 
         Parameters
         ----------
@@ -134,7 +134,7 @@ class ElevationGrid:
         fill_radius
             See `fill_holes`, metres; 0: nothing is filled.
         margin
-            More rows on both sides.
+            Number of additional rows on both sides.
         left, right
             Columns; None: to the last.
 
@@ -153,7 +153,7 @@ class ElevationGrid:
     def _spans(
         self, begin: int, end: int, left: int, right: int, fill_radius: float
     ) -> list[tuple[int, int]]:
-        """Return which columns may have heights in some rows, filled ones among them: from west to east."""
+        """Return ranges of columns that may have heights or filled holes in some rows, from west to east."""
         if self.boxes is None:
             return [(left, right)]
         reach = math.ceil(fill_radius / self.resolution)
@@ -172,7 +172,7 @@ class ElevationGrid:
     def _filled(
         self, begin: int, end: int, fill_radius: float, margin: int, left: int, right: int
     ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-        radius = round(fill_radius / self.resolution, 6)  # 0.6 / 0.2 is three columns, not a hair less
+        radius = round(fill_radius / self.resolution, 6)  # so that 0.6 / 0.2 is exactly three columns
         reach = fill_reach(radius)
         around = self.rows(begin - margin - reach, end + margin + reach, left - reach, right + reach)
         inner = (slice(reach, around.shape[0] - reach), slice(reach, around.shape[1] - reach))
@@ -190,9 +190,9 @@ class ElevationGrid:
     def blocks(
         self, fill_radius: float, *, from_north: bool = False, margin: int = 0
     ) -> Iterator[tuple[int, NDArray[np.float32], NDArray[np.uint8]]]:
-        """All rows, some at a time: first row, heights and kinds as in `filled`.
+        """Yield blocks of rows: number of the first row, heights and kinds as in `filled`.
 
-        From the north, blocks come in that order, and rows within each as well.
+        If from the north, blocks and the rows within each are in this order.
         """
         starts = range(0, self.shape[0], self.block_rows)
         for begin in reversed(starts) if from_north else starts:

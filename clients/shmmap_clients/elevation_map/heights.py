@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the height of a column is; and heights around a moving vehicle, from the layers of its window."""
+"""Definition of a column's height, and heights around a moving vehicle, from the layers of its window."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from shmmap.layers import canonical_layer
 __all__ = ["RULES", "ElevationRule", "WindowHeights"]
 
 RULES: Final = ("surface", "min", "mean", "max")
-_FARTHEST: Final = 1 << 40  # columns; no layer has any so far away
+_FARTHEST: Final = 1 << 40  # columns; beyond every layer
 
 
 @dataclass(frozen=True, slots=True)
 class ElevationRule:
-    """How columns are made of points.
+    """Rule for the height of a column from its points.
 
-    ``surface`` is what Autoware's elevation_map_loader has grid_map_pcl do (``height_type`` 1): the points
-    of a column fall into clusters, whose neighbouring points are no farther apart than ``tolerance``;
-    of the clusters of at least ``min_points`` whose mean height is at most ``height_range`` above the
-    lowest such mean, the one of most points gives its mean height (of equal ones the lowest).  It needs the
-    points.  On a slope it is off by as much as the points' middle is beside the column's: with n points
-    about 0.3 · resolution · slope / sqrt(n).  ``min``, ``mean`` and ``max`` are those of all points of the
-    column; the ``elevation`` layer has them.
+    ``surface`` is the rule of grid_map_pcl in Autoware's elevation_map_loader (``height_type`` 1).  Points
+    of a column form clusters, in which neighbouring points are at most ``tolerance`` apart.  Candidates are
+    clusters of at least ``min_points`` whose mean height is at most ``height_range`` above the lowest such
+    mean.  The height is the mean of the candidate with the most points (on a tie, the lowest).  This rule
+    requires points.  Its error on a slope, as the points' centre differs from the column's, is about
+    0.3 · resolution · slope / sqrt(n) for n points.  ``min``, ``mean`` and ``max`` are over all points of the
+    column, and are in the ``elevation`` layer.
 
     Attributes
     ----------
@@ -38,14 +38,14 @@ class ElevationRule:
     resolution
         Edge of a column, metres; column (i, j) reaches from i · resolution to (i + 1) · resolution.
     tolerance, height_range
-        Metres.
+        Limits of the ``surface`` rule, metres.
     min_points
-        Of a column, and of a cluster.
+        Least number of points of a column, and of a cluster.
 
     Raises
     ------
     BadRequest
-        A value makes no sense.
+        A value is invalid.
     """
 
     name: str = "surface"
@@ -68,7 +68,7 @@ class ElevationRule:
 
     @property
     def layer(self) -> str:
-        """Layer that the rule is answered from."""
+        """Layer from which the rule computes heights."""
         return "points" if self.name == "surface" else f"elevation(resolution={float(self.resolution)!r})"
 
     @property
@@ -78,7 +78,7 @@ class ElevationRule:
 
 
 class WindowHeights:
-    """Answers from the window as it is at each call; nothing is copied or kept.
+    """Heights from the current cells of a window, without copies.
 
     ::
 
@@ -90,14 +90,14 @@ class WindowHeights:
     Parameters
     ----------
     window
-        With the rule's layer.
+        Window of the rule's layer.
     rule
         ``min``, ``mean`` or ``max``.
 
     Raises
     ------
     BadRequest
-        The rule needs points.
+        The rule requires points.
     """
 
     def __init__(self, window: MapWindow, rule: ElevationRule) -> None:
@@ -110,9 +110,9 @@ class WindowHeights:
         self._layer = canonical_layer(rule.layer)
 
     def at(self, xy: NDArray[Any]) -> NDArray[np.float64]:
-        """Heights at places, (N, 2) metres, map frame: (N,) float64 metres, NaN where there is no point.
+        """Return heights at positions (N, 2), metres, map frame: (N,) float64 metres, NaN without a point.
 
-        A column that a border cuts is answered from both cells together.
+        A column on the border of two cells is computed from both.
         """
         column = np.floor(np.asarray(xy, np.float64) * (1.0 / self._rule.resolution))
         column = np.where(np.abs(column) < _FARTHEST, column, _FARTHEST).astype(np.int64)

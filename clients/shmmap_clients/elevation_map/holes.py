@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fills holes of a grid from the heights around them, in floating point.
 
-A hole that has a known height within the radius, and three to go by, gets the value, at its middle, of the
-plane that fits the known heights within the radius and two columns more best, weighted by 1 / distance²;
-so a slope continues through a hole.  Where those lie on one line it is their weighted mean.
-Upstream inpaints an 8-bit image of the whole map, where 100 m of relief make steps of 0.39 m.
+A column without a height is filled if there is a known height within the radius, and at least three within
+the radius plus two columns.  Its value is that of the best plane through these heights, weighted by
+1 / distance², at the column's centre, so that a slope continues through a hole.  If these heights lie on one
+line, the value is their weighted mean.  Upstream inpaints an 8-bit image of the whole map, where 100 m of
+relief have steps of 0.39 m.
 """
 
 from __future__ import annotations
@@ -20,19 +21,19 @@ from shmmap.compiling import compiled, read_only
 
 __all__ = ["fill_holes", "fill_reach"]
 
-_FIT_MORE: Final = 2.0  # columns: behind the rim of a hole, so that there is a plane and not a line
-_FARTHEST: Final = 100.0  # columns: the time goes with the square
-_LEAST: Final = 3  # heights: fewer are too lonely to say anything of their surroundings
+_FIT_MORE: Final = 2.0  # columns behind the rim of a hole, which make the heights a plane instead of a line
+_FARTHEST: Final = 100.0  # columns; time grows with the square
+_LEAST: Final = 3  # heights: fewer do not represent their surroundings
 _FLAT: Final = 1e-6  # relative determinant below which a plane is not determined
 
 
 def fill_reach(radius: float) -> int:
-    """How many columns away heights are looked at when filling within ``radius`` columns.
+    """Return the distance, in columns, of the heights that filling within ``radius`` columns uses.
 
     Raises
     ------
     BadRequest
-        The radius is negative, or so large that filling would not end.
+        The radius is negative, or so large that filling would take too long.
     """
     if not 0 <= radius <= _FARTHEST:
         raise BadRequest(f"holes are filled within 0 to {_FARTHEST:g} columns, not {radius:g}")
@@ -40,17 +41,17 @@ def fill_reach(radius: float) -> int:
 
 
 def fill_holes(heights: NDArray[np.float32], radius: float) -> NDArray[np.float32]:
-    """Return the heights with holes filled as far as known heights reach.
+    """Return the heights with holes filled where known heights are near.
 
-    A result depends on known heights within `fill_reach` alone: blocks with that much margin give the
-    same as the whole.
+    A filled height depends only on known heights within `fill_reach`, so that blocks with this margin give
+    the same result as the whole grid.
 
     Parameters
     ----------
     heights
         (rows, columns) float32, metres; NaN in holes.
     radius
-        Columns.
+        Radius in columns.
     """
     if not fill_reach(radius) or not heights.size:
         return heights
@@ -83,7 +84,7 @@ def _fill(heights: Any, radius: Any, reach: Any, result: Any) -> None:
                 continue
             s, sx, sy, sxx, sxy, syy, sz, sxz, syz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
             known = 0
-            about = np.nan  # sums are about the first neighbour, for their digits
+            about = np.nan  # sums are relative to the first neighbour, for precision
             for y in range(max(0, row - reach), min(rows, row + reach + 1)):
                 for x in range(max(0, column - reach), min(columns, column + reach + 1)):
                     d_x, d_y = np.float64(x - column), np.float64(y - row)

@@ -25,22 +25,22 @@ __all__ = ["check_output", "hillshade", "write_elevation", "write_hillshade"]
 
 _GEOTIFF: Final = (".tif", ".tiff")
 _SUFFIXES: Final = (".npz", ".png", *_GEOTIFF)
-_USER_DEFINED: Final = 32767  # GeoTIFF 1.1: the highest code, a system of the user's own
+_USER_DEFINED: Final = 32767  # GeoTIFF 1.1: the highest code, a user-defined system
 _TILE: Final = 256
-_FINEST_STEP: Final = 0.001  # metres: a PNG has no finer steps
+_FINEST_STEP: Final = 0.001  # metres: the finest step of a PNG
 _AZIMUTH: Final = math.radians(315.0)
 _ALTITUDE: Final = math.radians(45.0)
 _EXAGGERATION: Final = 2.0
 
 
 def check_output(path: Path, epsg: int | None = None) -> None:
-    """Find out before the work begins whether a file can be written as its suffix says.
+    """Check before the work begins that a file can be written in the format of its suffix.
 
     Raises
     ------
     BadRequest
-        The suffix is unknown; or it is a GeoTIFF's, and the package for these is not installed, or there is
-        no such coordinate system.
+        The suffix is unknown; or for a GeoTIFF, its package is not installed, or the coordinate system does
+        not exist.
     """
     suffix = path.suffix.lower()
     if suffix not in _SUFFIXES:
@@ -55,20 +55,20 @@ def check_output(path: Path, epsg: int | None = None) -> None:
 def write_elevation(
     path: Path, grid: ElevationGrid, fill_radius: float, document: dict[str, Any], *, epsg: int | None = None
 ) -> None:
-    """Write a grid; the file appears whole.
+    """Write a grid to a file that appears only when complete.
 
-    ``.npz``: ``height`` (rows, columns) float32 metres, row 0 the southernmost, NaN where there is none;
+    ``.npz``: ``height`` (rows, columns) float32 metres, row 0 the southernmost, NaN for no height;
     ``kind`` uint8 (0 nothing, 1 measured, 2 filled); ``resolution`` and ``origin`` (south-west corner
     of [0, 0], metres); ``document``, JSON.  ``.tif``: float32, NaN as no data, tiled.  ``.png``: 16
-    bits, 0 where there is none, else ``z = z_min + (value - 1) * step`` with both in ``PATH.json``,
-    and a world file; the one lossy format, its step at least a millimetre.
+    bits, 0 for no height, else ``z = z_min + (value - 1) * step`` with both in ``PATH.json``,
+    and a world file.  This format alone is lossy, with a step of at least a millimetre.
 
     Parameters
     ----------
     fill_radius
         See `fill_holes`, metres.
     document
-        What the file is of, for people and programs.
+        Description of the contents, for users and programs.
     epsg
         Coordinate system for a GeoTIFF.
 
@@ -100,7 +100,7 @@ def write_hillshade(path: Path, grid: ElevationGrid, fill_radius: float) -> None
 
 @contextlib.contextmanager
 def _interim(path: Path) -> Iterator[Path]:
-    """Yield a name to write to; what is there in the end takes the place of ``path``."""
+    """Yield a temporary name to write to; at the end, rename that file to ``path``."""
     interim = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
         yield interim
@@ -161,12 +161,12 @@ def _geotiff(
             description=json.dumps(document),
             extratags=tags,
             bigtiff=math.prod(grid.shape) > 1 << 29,
-            maxworkers=1,  # several would have a quarter of a gigabyte of tiles waiting for them
+            maxworkers=1,  # several workers would queue a quarter of a gigabyte of tiles
         )
 
 
 def _tiles(grid: ElevationGrid, fill_radius: float) -> Iterator[NDArray[np.float32]]:
-    """Tiles from the north-west, row by row; those at the edges are full as well."""
+    """Yield tiles from the north-west, row by row; tiles at the edges also have the full size."""
     rows, columns = grid.shape
     for top in range(0, rows, _TILE):
         for left in range(0, columns, _TILE):
@@ -193,7 +193,7 @@ def _png(path: Path, grid: ElevationGrid, fill_radius: float, document: dict[str
 
 
 def _world_file(path: Path, grid: ElevationGrid) -> None:
-    """Six lines: pixel sizes and the middle of the upper left pixel."""
+    """Write the six lines of a world file: pixel sizes and centre of the upper left pixel."""
     west, south = grid.origin
     north = south + grid.shape[0] * grid.resolution
     half = grid.resolution / 2
@@ -203,20 +203,20 @@ def _world_file(path: Path, grid: ElevationGrid) -> None:
 
 
 def hillshade(heights: NDArray[np.float32], resolution: float) -> NDArray[np.uint8]:
-    """Shade rows; the first and the last row, which only serve as neighbours, are left out.
+    """Return shaded rows, without the first and the last, which only serve as neighbours.
 
-    Slopes after Horn (1981); a missing neighbour counts as level.
+    Slopes are by Horn (1981), where a missing neighbour counts as level.
 
     Parameters
     ----------
     heights
-        (n + 2, columns) float32, metres, row 0 the southernmost; NaN where there is none.
+        (n + 2, columns) float32, metres, row 0 the southernmost; NaN for no height.
     resolution
-        Metres.
+        Edge of a column, metres.
 
     Returns
     -------
-    (n, columns, 2) uint8: grey, and 255 where there is a height, 0 where not.
+    (n, columns, 2) uint8: grey, and alpha: 255 for a height, 0 for none.
     """
     middle = heights[1:-1].astype(np.float64)
     known = ~np.isnan(middle)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Columns that several cells share: their points wait until the last of those cells has come."""
+"""Columns shared by several cells: their points are kept until the last of these cells is loaded."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 __all__ = ["ColumnBox", "Columns", "Seams", "column_boxes"]
 
-# beyond its box to which a cell may have points, by rounding: metres, and what float32 coordinates add
+# margin around a cell's box for rounded points: metres, and a relative part for float32 coordinates
 _MARGIN: Final = 1e-3
 _ROUNDING: Final = 2.0**-22
 
@@ -61,12 +61,12 @@ class Columns:
         return Columns(self.i[chosen], self.j[chosen], self.values[chosen])
 
     def inside(self, box: ColumnBox) -> NDArray[np.bool_]:
-        """Which rows are in a box."""
+        """Return a mask of the rows in a box."""
         return (self.i >= box.i0) & (self.i < box.i1) & (self.j >= box.j0) & (self.j < box.j1)
 
     @classmethod
     def joined(cls, parts: Sequence[Columns]) -> Columns:
-        """Return these columns, one after the other; there must be one."""
+        """Return the concatenation of these columns, of which there must be at least one."""
         return cls(
             np.concatenate([part.i for part in parts]),
             np.concatenate([part.j for part in parts]),
@@ -75,17 +75,17 @@ class Columns:
 
 
 class Seams:
-    """Holds back what later cells may add to.
+    """Storage of rows in columns to which later cells may add.
 
     Parameters
     ----------
     boxes
-        (N, 4) int64: the `ColumnBox` of each cell, in the order in which cells come.
+        (N, 4) int64: the `ColumnBox` of each cell, in loading order.
 
     Attributes
     ----------
     waiting
-        Rows held back, by the cell that brought them last.
+        Rows kept back, by the last cell that contributed to them.
     """
 
     def __init__(self, boxes: NDArray[np.int64]) -> None:
@@ -96,7 +96,7 @@ class Seams:
         self._tallest = int((boxes[:, 3] - boxes[:, 1]).max(initial=0))
 
     def _near(self, number: int, box: ColumnBox) -> list[tuple[int, ColumnBox]]:
-        """Find the other cells that share columns with a cell, and which columns."""
+        """Return the other cells that share columns with a cell, and these columns."""
         begin, end = np.searchsorted(self._rows, (box.j0 - self._tallest, box.j1))
         some = self._by_row[begin:end]
         i0, j0, i1, j1 = self._boxes[some].T
@@ -104,14 +104,14 @@ class Seams:
         return [(n, ColumnBox(*self._boxes[n].tolist()).common(box)) for n in some.tolist()]
 
     def add(self, number: int, rows: Columns | None) -> Columns | None:
-        """Take the rows of cell ``number``, the next in order; return what no later cell adds to.
+        """Add the rows of cell ``number``, the next in order; return the rows of columns now complete.
 
         Parameters
         ----------
         number
-            Cells before it have come, those after it have not.
+            Number of the cell; all before it have been added.
         rows
-            All in the cell's box; None: it has none.
+            Rows, all in the cell's box; None: the cell has none.
         """
         box = ColumnBox(*self._boxes[number].tolist())
         shared = self._near(number, box)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The lowest surface of each column: clusters, and the mean height of the chosen one.
 
-Importing this module compiles the kernel, or loads it from numba's cache (tenths of a second).
+Importing this module compiles the kernel, or loads it from numba's cache within tenths of a second.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ __all__ = ["surface_heights"]
 def surface_heights(
     xyz: NDArray[Any], column: NDArray[np.int64], rule: ElevationRule
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the columns that have points, ascending, and the height of each.
+    """Return the columns with points, ascending, and their heights.
 
     Parameters
     ----------
     xyz
         (N, 3) float32 or float64, metres.
     column
-        (N,) int64: which column each point is in.
+        (N,) int64: column of each point.
     rule
         Tolerance, height range and least number of points.
 
@@ -55,7 +55,7 @@ def _root(parent: Any, member: Any) -> Any:
 
 @inlined
 def _join(xyz: Any, first: Any, size: Any, tolerance: Any, parent: Any) -> None:
-    """Join points of a column into clusters: ``parent`` leads from each to its cluster's lowest."""
+    """Join points of a column into clusters; ``parent`` links each point to its cluster's lowest."""
     squared = tolerance * tolerance
     for k in range(size):
         parent[k] = k
@@ -70,7 +70,7 @@ def _join(xyz: Any, first: Any, size: Any, tolerance: Any, parent: Any) -> None:
                 continue
             d_x, d_y = x - xyz[first + other, 0], y - xyz[first + other, 1]
             if d_x * d_x + d_y * d_y + d_z * d_z <= squared:
-                # the older root stays: own may be it already
+                # keep the older root, which may already be own
                 low, high = min(root, own), max(root, own)
                 parent[high] = low
                 own = low
@@ -82,7 +82,7 @@ def _join(xyz: Any, first: Any, size: Any, tolerance: Any, parent: Any) -> None:
     ),
 )
 def _surface(xyz: Any, bounds: Any, tolerance: Any, height_range: Any, min_points: Any, heights: Any) -> None:
-    """``xyz`` sorted by column and height, column n in rows ``bounds[n] : bounds[n + 1]``."""
+    """Return ``xyz`` sorted by column and height; column n is in rows ``bounds[n] : bounds[n + 1]``."""
     largest = 0
     for n in range(heights.shape[0]):
         largest = max(largest, bounds[n + 1] - bounds[n])

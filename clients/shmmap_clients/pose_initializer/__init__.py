@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a vehicle is, from a rough pose (GNSS, a click on a map) and one scan.
+"""Localization of a vehicle from a rough pose (GNSS, a click on a map) and one scan.
 
 ::
 

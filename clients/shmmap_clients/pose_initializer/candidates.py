@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where to look for a vehicle: a rough pose, and candidates that are drawn from it and then learn."""
+"""Candidates for a vehicle's pose, drawn first from a rough pose, then from the scores so far."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ class RoughPose:
     ----------
     x, y
     z
-        Taken where the map has no ground near the place; else the ground's height counts.
+        Height, used only if the map has no ground near the position; else the ground's height is used.
     roll, pitch, yaw
     sigma_m
         Standard deviation of x and of y.
     sigma_yaw
-        Of the heading; pi / sqrt(3) and more: it is not known at all.
+        Standard deviation of the heading; pi / sqrt(3) or more: unknown.
     covariance
-        (3, 3) of x, y, yaw, in place of both; as nested tuples.
+        (3, 3) covariance of x, y, yaw, instead of both, as nested tuples.
     """
 
     x: float
@@ -66,7 +66,7 @@ class RoughPose:
 
     @property
     def mean(self) -> NDArray[np.float64]:
-        """(x, y, yaw)."""
+        """The mean (x, y, yaw)."""
         return np.array([self.x, self.y, self.yaw])
 
     @property
@@ -78,17 +78,17 @@ class RoughPose:
 
     @property
     def heading_unknown(self) -> bool:
-        """Whether the yaw says nothing."""
+        """Whether the heading is unknown."""
         return float(np.linalg.norm(self.factor[2])) >= _UNKNOWN_YAW * 0.999
 
 
 class ParzenEstimator:
-    """Proposes candidates in batches, and learns their scores.
+    """Generator of candidates in batches, which learns from their scores.
 
-    A tree-structured Parzen estimator over (x, y, yaw), as Autoware's initializer has one.  The first
-    candidates are drawn from the rough pose's own distribution.  Then of 100 draws the one is taken that is
-    most like the best tenth of what was tried and least like the rest (Bergstra et al. 2011; the weight 5 of
-    the rest, the kernels' widths and the number of draws are Autoware's).
+    A tree-structured Parzen estimator over (x, y, yaw), as in Autoware's initializer.  The first candidates
+    are drawn from the distribution of the rough pose.  Later candidates are each the one of 100 draws that
+    is most like the best tenth of the scored candidates and least like the rest (Bergstra et al. 2011; the
+    weight 5 of the rest, the kernels' widths and the number of draws are Autoware's).
 
     Parameters
     ----------
@@ -105,13 +105,13 @@ class ParzenEstimator:
         self._scores = np.empty(0)
 
     def first(self, count: int) -> NDArray[np.float64]:
-        """Return (count, 3) candidates of the prior; the rough pose itself is the first."""
+        """Return (count, 3) candidates from the prior; the first is the rough pose itself."""
         drawn = self._draw(count)
         drawn[0] = self._rough.mean
         return drawn
 
     def next(self, count: int) -> NDArray[np.float64]:
-        """Return (count, 3) candidates where good ones are expected."""
+        """Return (count, 3) candidates with high expected scores."""
         drawn = self._draw(count * _DRAWS)
         good = min(_MAX_GOOD, len(self._scores) // 10)
         if not good:
@@ -122,12 +122,12 @@ class ParzenEstimator:
         return np.asarray(drawn[chosen], np.float64)
 
     def learn(self, candidates: NDArray[np.float64], scores: NDArray[np.float64]) -> None:
-        """Add candidates and their scores; a greater score is better."""
+        """Add candidates and their scores; a higher score is better."""
         self._tried = np.concatenate([self._tried, candidates])
         self._scores = np.concatenate([self._scores, scores])
 
     def best(self, count: int, apart_m: float, apart_yaw: float) -> NDArray[np.float64]:
-        """Return the best candidates, no two of them near each other in place and heading."""
+        """Return the best candidates, no two of them near each other in position and heading."""
         kept: list[NDArray[np.float64]] = []
         for index in np.argsort(-self._scores, kind="stable"):
             one = self._tried[index]
@@ -147,10 +147,10 @@ class ParzenEstimator:
         return np.asarray(drawn, np.float64)
 
     def _density(self, at: NDArray[np.float64], which: NDArray[np.intp]) -> NDArray[np.float64]:
-        """Logarithm of the mean of the kernels on what was tried, up to a constant."""
+        """Return the logarithm of the mean of the kernels at scored candidates, up to a constant."""
         exponent = np.zeros((len(at), len(which)))
         for axis, width in enumerate(_KERNEL.tolist()):
-            # one axis at a time, in place: whole turns off, in widths of the kernel, squared
+            # in place, one axis at a time: wrap angles, divide by the kernel's width, square
             off = at[:, axis, None] - self._tried[which, axis]
             if axis == 2:
                 off -= 2 * math.pi * np.rint(off / (2 * math.pi))

@@ -141,7 +141,7 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _document(found: InitialPose | None, left_out: dict[str, int]) -> dict[str, Any]:
-    """Return the JSON; None: there is no map."""
+    """Return the result as JSON; None: there is no map."""
     result = None if found is None else found.result
     covariance = None if result is None else result.covariance
     return {

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The initialization: the map around the place, the ground's height, candidates, alignments."""
+"""Initialization of a pose: map around the rough pose, height of the ground, candidates, alignments."""
 
 from __future__ import annotations
 
@@ -45,13 +45,13 @@ _DOUBLINGS: Final = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alternative:
-    """Another pose that the scan might have been taken from.
+    """Another possible pose of the scan.
 
     Attributes
     ----------
     T_map_base : (4, 4) float64
     score
-        Transform probability there.
+        Transform probability of this pose.
     nvtl
         Nearest-voxel transformation likelihood.
     """
@@ -63,25 +63,25 @@ class Alternative:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InitialPose:
-    """The best pose, and what speaks for it.
+    """The best pose, with its evidence.
 
     Attributes
     ----------
     result
-        The alignment that ended there.
+        Alignment that ended at this pose.
     score
-        Its transform probability: over all points, also those that found no map.
+        Transform probability of the alignment, over all points, including those without map.
     reliable
-        Whether the result is within all limits of trust.
+        Whether the result meets all limits of trust.
     ground_z
-        Height of the map's ground below the pose, metres: of the two heights that the search tries, the one
-        that fits; None where there is none near.
+        Height of the map's ground below the pose, metres: the better of the two heights that the search
+        tries; None if there is no ground near.
     alternatives
-        Others, best first; at least a metre or ten degrees away from the best and each other.
+        Other poses, best first, at least a metre or ten degrees from the best and from each other.
     candidates
-        Poses that were scored.
+        Number of scored poses.
     map_s, search_s
-        Seconds for the map around the place, and for the search.
+        Seconds for loading the map, and for the search.
     """
 
     result: Result
@@ -101,30 +101,30 @@ class InitialPose:
 
 @dataclass(frozen=True, slots=True)
 class InitializerRules:
-    """How to search.
+    """Parameters of the search.
 
     Attributes
     ----------
     map_radius
-        Of the map that is asked for, metres (a square of that half-side).
+        Half-side of the requested square of the map, metres.
     leaf
         Edge of a voxel, metres.
     height
-        Of the scan's frame above the ground, metres; 0 for Autoware's base_link.  None: the rough pose's z is
-        right, and the map's ground is not asked.
+        Height of the scan's frame above the ground, metres; 0 for Autoware's base_link.  None: use the rough
+        pose's z, without the map's ground.
     candidates
-        Poses that are scored: half drawn from the rough pose, half where good ones are expected.
+        Number of scored poses: half from the rough pose, half where high scores are expected.
     starts
-        The best of them that are aligned.
+        Number of best candidates to align.
     finals
-        The best of those that are aligned with the whole scan.
+        Number of best alignments to repeat with the whole scan.
     scoring_points
-        Points of the scan that score candidates and align the starts.
+        Number of points of the scan for scoring candidates and for aligning the starts.
     wait_s
-        How long the map may take.  The first time on a machine kernels are compiled for its layers, which
-        takes a minute or more on a slow or busy one.
+        Time for the map to load, seconds.  The first use on a machine compiles the kernels of its layers,
+        which takes a minute or more on a slow or busy one.
     seed
-        The same seed searches the same way.
+        Seed of the random candidates; the same seed gives the same search.
     """
 
     map_radius: float = 150.0
@@ -143,19 +143,19 @@ class InitializerRules:
 
 
 class PoseInitializer:
-    """Finds initial poses; keeps its map, so that the next one costs no loading.
+    """Searcher of initial poses, which keeps its map for the next search.
 
     Parameters
     ----------
     client
-        A session with the daemon, or a socket as in `shmmap.connect`: then it has a session of its own.
+        A session with the daemon, or a socket as in `shmmap.connect` for a session of its own.
     rules
     limits, trust
-        Of the final alignments, as in `NdtMatcher`.
+        Limits of the final alignments, as in `NdtMatcher`.
     backend, device, fallback
-        What computes, as in `Settings`.
+        Backend that computes, as in `Settings`.
     threads
-        As in `NdtMatcher`.
+        Number of threads, as in `NdtMatcher`.
 
     Raises
     ------
@@ -213,35 +213,35 @@ class PoseInitializer:
         self.close()
 
     def close(self) -> None:
-        """Release the map, and end the session if it is its own."""
+        """Release the map, and end the initializer's own session, if any."""
         self._window.close()
         self._coarse.close()
         self._fine.close()
 
     def initialize(self, points: NDArray[np.floating], rough: RoughPose, *, effort: int = 1) -> InitialPose:
-        """Find where a scan was taken.
+        """Find the pose of a scan.
 
         Parameters
         ----------
         points : (N, 3)
             The scan, base frame, metres.
         rough
-            Where it was probably taken.
+            Rough pose of the scan.
         effort
-            Factor on the number of candidates that are drawn from the rough pose.
+            Factor on the number of candidates drawn from the rough pose.
 
         Raises
         ------
         NoMapHere
-            The map has nothing around the place.
+            The map has no cells around the rough pose.
         ShmmapError
-            The daemon cannot be asked.
+            The daemon cannot be reached.
         """
         began = time.perf_counter()
         self._take_map(rough)
         had_map = time.perf_counter()
         height = self.rules.height
-        # the rough z is a guess of GNSS; the ground of the map is known to centimetres
+        # the rough z is a guess from GNSS; the map's ground is known to centimetres
         grounds = self._grounds(rough.x, rough.y)
         heights = [z + height for z in grounds] if height is not None and grounds else [rough.z]
 
@@ -286,18 +286,18 @@ class PoseInitializer:
 
     @property
     def trust(self) -> TrustLimits:
-        """Limits of trust that are in force, for the map that was searched last."""
+        """Limits of trust for the last searched map."""
         return self._fine.trust
 
     @property
     def fault(self) -> DeviceError | None:
-        """Why the fallback computes; None as long as it does not."""
+        """Reason why the fallback computes; None while it does not."""
         return self._coarse.fault or self._fine.fault
 
     def _grounds(self, x: float, y: float) -> list[float]:
-        """Return the heights of the ground worth a try: the median, then the lowest where it is another one.
+        """Return heights of the ground to try: the median, then the lowest if it differs.
 
-        Where the rough pose is beside the street, half of the columns may be higher than it.
+        If the rough pose is beside the street, more than half of the columns may be above the ground.
         """
         cells = [cell for cell in self._window.cells if cell.layer == self._ground]
         grids = [(cell["min"], cell.header.lattice) for cell in cells]
@@ -308,7 +308,7 @@ class PoseInitializer:
         return [median] if abs(lowest - median) < _SAME_HEIGHT_M else [median, lowest]
 
     def _ground_below(self, T_map_base: NDArray[np.float64]) -> float | None:
-        """Return the height of the ground that fits a pose best."""
+        """Return the tried height of the ground that fits a pose best."""
         x, y, z = T_map_base[:3, 3].tolist()
         grounds = self._grounds(x, y)
         if self.rules.height is None:
@@ -317,7 +317,7 @@ class PoseInitializer:
         return min(grounds, key=lambda ground: abs(ground - stands_at), default=None)
 
     def _take_map(self, rough: RoughPose) -> None:
-        """Fetch the map around a place."""
+        """Fetch the map around a position."""
         self._window.move_to(rough.x, rough.y, wait=self.rules.wait_s)
         voxels = {cell.id: cell for cell in self._window.cells if cell.layer == self._voxels}
         if not voxels:
@@ -345,7 +345,7 @@ class PoseInitializer:
             self._versions = versions
 
     def _window_is_empty(self, rough: RoughPose) -> NoReturn:
-        """Raise why there is no map around the place."""
+        """Raise an error that explains why there is no map around the position."""
         if not self._window.complete:
             raise NoAnswer(
                 f"no cell around ({rough.x:.3f}, {rough.y:.3f}) was loaded within {self.rules.wait_s:g} s",
@@ -363,7 +363,7 @@ def _split(count: int, parts: int) -> list[int]:
 
 
 def _apart(results: list[Result]) -> list[Result]:
-    """Leave out what is near a better one."""
+    """Return the poses that are not near a better one."""
     kept: list[Result] = []
     for result in results:
         T = result.T_map_base
@@ -378,23 +378,23 @@ def _apart(results: list[Result]) -> list[Result]:
 
 
 class Relocalizer:
-    """Searches around a probable pose; after each failure twice as far, up to eight times.
+    """Search around a predicted pose, doubling the radius after each failure, up to eight times.
 
-    Twice as far takes twice as many candidates to begin with.  The search begins at ``sigma_m`` again when it
-    has found the vehicle.  It is a `shmmap_clients.ndt_scan_matcher.drive.follower.Relocalize`.
+    A doubled radius also doubles the number of first candidates.  After success, the radius is ``sigma_m``
+    again.  This class is a `shmmap_clients.ndt_scan_matcher.drive.follower.Relocalize`.
 
     Parameters
     ----------
     initializer
-        Returns the initializer, which stays the caller's to close; called at the first search, for it has
-        a map of its own.
+        Returns the initializer, which has its own map, and which the caller closes; called at the first
+        search.
     sigma_m, sigma_yaw
         Standard deviation of x and y, metres, and of the heading, radians, at the first attempt.
 
     Attributes
     ----------
     error
-        Why the last search could not be made, or None.
+        Error that prevented the last search, or None.
     """
 
     def __init__(
@@ -415,7 +415,7 @@ class Relocalizer:
         points : (N, 3)
             The scan, base frame, metres.
         T_guess : (4, 4)
-            Where it was probably taken.
+            Predicted pose of the scan.
         """
         wider = 2 ** min(self._failures, _DOUBLINGS)
         x, y, z, roll, pitch, yaw = pose_from_matrix(T_guess).tolist()
@@ -428,7 +428,7 @@ class Relocalizer:
             if self._initializer is None:
                 self._initializer = self._make()
             found = self._initializer.initialize(points, rough, effort=wider)
-        except ShmmapError as error:  # no map there, no daemon: the next scan may have better luck
+        except ShmmapError as error:  # no map or no daemon: the next scan may succeed
             self.error = error
             return None
         if not found.reliable:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Maps scans with poses into a live map of the daemon, as Rolling-Bonxai does, and draws what is there."""
+"""Maps scans with poses into a live map of the daemon, as Rolling-Bonxai does, and draws the map."""
 
 from __future__ import annotations
 

@@ -142,7 +142,7 @@ def _add_output_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_filter_options(parser: argparse.ArgumentParser) -> None:
-    """Add the limits of the points that count."""
+    """Add the options that limit which points are used."""
     group = parser.add_argument_group(
         "points that count", "In the sensor's frame; what is given here counts before what --params says."
     )
@@ -167,7 +167,7 @@ def _parts(text: str) -> frozenset[str]:
 
 
 def _parameters_from(args: argparse.Namespace) -> Parameters | None:
-    """Read the parameter file, if one is given, and say what of it has no effect."""
+    """Read the parameter file, if given, and report parameters without effect."""
     if args.params is None:
         return None
     from shmmap_clients.rolling_map.parameters import read_parameters
@@ -179,12 +179,12 @@ def _parameters_from(args: argparse.Namespace) -> Parameters | None:
 
 
 def _scan_filter_from(args: argparse.Namespace, parameters: Parameters | None) -> ScanFilter:
-    """Return which points count.
+    """Return the filter of the points to use.
 
     Raises
     ------
     BadRequest
-        The options leave no point.
+        The options exclude all points.
     """
     import msgspec
 
@@ -202,7 +202,7 @@ def _scan_filter_from(args: argparse.Namespace, parameters: Parameters | None) -
 
 
 def _shown_from(args: argparse.Namespace, parameters: Parameters | None) -> Shown:
-    """Return what is shown."""
+    """Return the choice of displayed items."""
     from shmmap_clients.rolling_map.parameters import Shown
 
     if args.show is not None:
@@ -225,7 +225,7 @@ def _run(args: argparse.Namespace) -> int:
             hint="leave it out: a publisher's scans count as they come",
         )
     with contextlib.ExitStack() as stack:
-        # the map's own limits leave out points and count them
+        # the map filters and counts points by its own limits
         drive = ScanDrive(args, _NAME, args.poses, stack, reader=reader_from(args, _NAME, min_range=None))
         client = stack.enter_context(connect(args, _NAME))
         live = client.live(args.live, frame_id=_frame(args, parameters))
@@ -244,7 +244,7 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _leave_out_mapped(args: argparse.Namespace, drive: ScanDrive, mapper: LiveMapper) -> None:
-    """Begin after the scans of the directory that are in the map."""
+    """Skip the scans of the directory that are already in the map."""
     from shmmap_clients.scans.scan_sequence import ScanSequence
 
     scans = drive.scans
@@ -260,7 +260,7 @@ def _leave_out_mapped(args: argparse.Namespace, drive: ScanDrive, mapper: LiveMa
 
 
 def _frame(args: argparse.Namespace, parameters: Parameters | None) -> str:
-    """Frame of the poses; empty for the map's."""
+    """Return the frame of the poses; empty for the map's frame."""
     if args.frame is not None:
         return str(args.frame)
     if parameters is not None and "map_frame" in parameters.origins:
@@ -271,17 +271,17 @@ def _frame(args: argparse.Namespace, parameters: Parameters | None) -> str:
 def _wait_until_saved(
     args: argparse.Namespace, drive: ScanDrive, mapper: LiveMapper, statistics: DriveStatistics
 ) -> int:
-    """Wait until everything is in memory and on the disk; returns the exit code."""
+    """Wait until all scans are applied and on disk; return the exit code."""
     from shmmap import NoAnswer
 
     last = statistics.last
     if last is None and args.resume and mapper.applied:
-        return 0  # the run before had come to the end
+        return 0  # the previous run had processed all scans
     if last is None:
         return drive.no_scans()
     if args.wait > 0:
         end_s = time.monotonic() + args.wait
-        with contextlib.suppress(NoAnswer):  # what is missing is said below
+        with contextlib.suppress(NoAnswer):  # missing scans are reported below
             mapper.wait_applied(args.wait)
             mapper.wait_durable(max(0.1, end_s - time.monotonic()))
         if mapper.durable < last:
@@ -360,7 +360,7 @@ def _add_config(subparsers: Any) -> None:
 
 
 def _config(args: argparse.Namespace) -> int:
-    """Read, and print or write."""
+    """Read the parameter file, and print or write the settings."""
     import msgspec
 
     from shmmap_clients.rolling_map.parameters import live_section, read_parameters

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The live map as this program uses it: scans sent to it, all its voxels, its memory."""
+"""Use of the live map by this program: sending scans, reading all voxels, reporting memory."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from shmmap_clients.spread import Decimated, RunningSpread
 
 __all__ = ["DriveStatistics", "MappedScan", "all_voxels", "map_scan", "states_text", "usage_text"]
 
-_SIDE: Final = 64  # of a chunk, voxels
+_SIDE: Final = 64  # side of a chunk, voxels
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,15 +31,15 @@ class MappedScan:
     Attributes
     ----------
     scan
-        As it came.
+        The scan as read.
     number
-        Of this mapper's scans.
+        Number of the scan among this mapper's scans.
     counts
-        Of its points, by what became of them.
+        Number of its points by outcome.
     on_their_way
-        Scans that were sent and are not applied, this one included.
+        Number of scans sent but not applied yet, including this one.
     add_s
-        How long marking and sending it took, with waiting for room.
+        Seconds for marking and sending the scan, including the wait for space.
     """
 
     scan: Scan
@@ -57,7 +57,7 @@ def map_scan(scan: Scan, mapper: LiveMapper) -> MappedScan:
     BadRequest
         The scan has no pose.
     ShmmapError
-        The daemon does not take it.
+        The daemon refuses the scan.
     """
     begin_s = time.perf_counter()
     number = mapper.add(scan.xyz, scan.pose)
@@ -66,12 +66,12 @@ def map_scan(scan: Scan, mapper: LiveMapper) -> MappedScan:
 
 
 class DriveStatistics:
-    """Sums over the scans of a drive; its size does not depend on how many.
+    """Running statistics of a drive's scans, in constant memory.
 
     Parameters
     ----------
     live
-        The map, for progress that says what it takes.
+        The map, whose memory the progress shows.
     """
 
     def __init__(self, live: LiveMap | None = None) -> None:
@@ -99,22 +99,22 @@ class DriveStatistics:
 
     @property
     def counted(self) -> int:
-        """Points that counted: in range, or beyond it."""
+        """Number of points used, within or beyond the range."""
         return self._counts["near"] + self._counts["far"]
 
     @property
     def path(self) -> Sequence[tuple[float, float, float]]:
-        """Where the sensor was, metres; of a long drive a part of the places."""
+        """Positions of the sensor, metres; a subset for a long drive."""
         path = self._path.values
         return path if self._position is None or path[-1] == self._position else [*path, self._position]
 
     @property
     def left_out(self) -> str:
-        """Why points were left out, and how many; empty where none was."""
+        """Description of the points left out, with counts; empty if there are none."""
         return _left_out(self._counts)
 
     def line(self, mapped: MappedScan) -> str:
-        """One line about the latest scan."""
+        """Return one line about the latest scan."""
         counts = {name: getattr(mapped.counts, name) for name in ScanCounts.__struct_fields__}
         left_out = _left_out(counts)
         return (
@@ -127,7 +127,7 @@ class DriveStatistics:
         )
 
     def summary(self, *, applied: int, durable: int) -> dict[str, Any]:
-        """Return what ``--json`` prints of the drive; times in milliseconds, null without a scan."""
+        """Return the JSON object that ``--json`` prints; times in milliseconds, null without a scan."""
         return {
             "scans": self.scans,
             "points": self.points,
@@ -141,14 +141,14 @@ class DriveStatistics:
 
 
 def usage_text(usage: LiveMapRow) -> str:
-    """Say how large a map is: 1 234 567 active cells, 12.3 MB, 27 chunks."""
+    """Return the size of a map as text: 1 234 567 active cells, 12.3 MB, 27 chunks."""
     waiting = f", {usage.waiting_bytes / 1e6:.1f} MB waiting" if usage.waiting_bytes else ""
     active = f"{usage.active:,}".replace(",", " ")
     return f"{active} active cells, {usage.bytes / 1e6:.1f} MB, {usage.chunks} chunks{waiting}"
 
 
 def _usage_now(live: LiveMap) -> str:
-    """Say how large the map is now; a daemon that is away keeps no scan from being read."""
+    """Return the present size of the map, or that the daemon does not answer, as text."""
     try:
         return usage_text(live.status())
     except (DaemonUnreachable, LiveInterrupted):
@@ -156,7 +156,7 @@ def _usage_now(live: LiveMap) -> str:
 
 
 def states_text(chunks: Sequence[ChunkInfo]) -> str:
-    """How many chunks are in which state, in words; the most frequent first."""
+    """Return the number of chunks in each state as text, most frequent first."""
     states = Counter(row.state for row in chunks)
     return ", ".join(f"{count} {state}" for state, count in states.most_common())
 
@@ -167,17 +167,17 @@ def _left_out(counts: Counter[str] | dict[str, int]) -> str:
 
 
 def all_voxels(live: LiveMap, kind: str, scope: str = "memory") -> NDArray[np.float64]:
-    """Middles of all occupied or free voxels, (N, 3) metres in the map's frame.
+    """Return the centres of all occupied or free voxels, (N, 3), metres, map frame.
 
     Parameters
     ----------
     kind, scope
-        As `shmmap.live.LiveMap.voxels` takes them.
+        As in `shmmap.live.LiveMap.voxels`.
 
     Raises
     ------
     OverBudget
-        The daemon has no memory for a list at all.
+        The daemon has no memory even for the voxels of a minimal box.
     """
     rows = live.chunks(saved=scope != "memory")
     keys = np.array([row.key for row in rows], np.int64).reshape(-1, 3) * _SIDE
@@ -205,7 +205,7 @@ def all_voxels(live: LiveMap, kind: str, scope: str = "memory") -> NDArray[np.fl
 
 
 def _box(low: NDArray[np.int64], high: NDArray[np.int64], resolution: float) -> Box:
-    """Return the box of voxels from ``low`` to below ``high``: no voxel has its middle on its faces."""
+    """Return the box of voxels from ``low`` to below ``high``; no voxel has its centre on a face."""
     (x0, y0, z0), (x1, y1, z1) = (low * resolution).tolist(), (high * resolution).tolist()
     return Box(x0, y0, x1, y1, (z0, z1))
 
@@ -213,7 +213,7 @@ def _box(low: NDArray[np.int64], high: NDArray[np.int64], resolution: float) -> 
 def _halves(
     low: NDArray[np.int64], high: NDArray[np.int64]
 ) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """Two halves along the longest axis, between chunks as long as there are several."""
+    """Return two halves along the longest axis, split between chunks if there are several."""
     axis = int((high - low).argmax())
     size = int(high[axis] - low[axis])
     half = size // 2 if size <= _SIDE else size // _SIDE // 2 * _SIDE

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reads a YAML file of parameters as ROS 2 has them: names, values, and the line of each.
+"""Reader of a ROS 2 parameter file in YAML: names, values, and the line of each.
 
-The names may stand at the top, as Rolling-Bonxai ships its file, or under ``NODE: ros__parameters:``.  Names
-inside names are joined by dots.
+The names may be at the top level, as in the file of Rolling-Bonxai, or under ``NODE: ros__parameters:``.
+Nested names are joined by dots.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ class Entry(NamedTuple):
     Attributes
     ----------
     value
-        None where it is no single value: a list, or nothing.
+        Value of the parameter; None for a list or an empty value.
     text
-        The value as it is written; empty for a list.
+        Text of the value in the file; empty for a list.
     origin
         ``FILE:LINE``.
     """
@@ -53,7 +53,7 @@ def read_parameter_file(path: str | os.PathLike[str]) -> dict[str, Entry]:
     MapMissing
         There is no such file.
     ConfigError
-        It cannot be read, is no YAML, has no parameters or those of several nodes, or one of them twice.
+        The file cannot be read or is not YAML; has no parameters or those of several nodes; or repeats one.
     """
     name = os.fspath(path)
     try:
@@ -88,7 +88,7 @@ def read_parameter_file(path: str | os.PathLike[str]) -> dict[str, Entry]:
 
 
 def _check_shape(text: str, name: str) -> None:
-    """Refuse what ROS 2 reads neither: aliases, and names very deep inside names, which would take long."""
+    """Refuse YAML that ROS 2 does not read either: aliases and very deep nesting, which would take long."""
     depth = 0
     for event in yaml.parse(text, Loader=yaml.SafeLoader):
         depth += isinstance(event, yaml.CollectionStartEvent)
@@ -141,7 +141,7 @@ def _named(node: yaml.Node, name: str, prefix: str) -> Iterator[tuple[str, yaml.
 
 
 def _value(node: yaml.Node) -> tuple[Value, str]:
-    """Read a value as ROS 2 does, which takes 1e-1 for a number; PyYAML does not."""
+    """Read a value as ROS 2 does; unlike PyYAML, it accepts 1e-1 as a number."""
     if not isinstance(node, yaml.ScalarNode):
         return None, ""
     text = str(node.value)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The parameters of Rolling-Bonxai, version 1, and the section of the daemon's settings that means the same.
+"""Parameters of Rolling-Bonxai, version 1, and the equivalent section of the daemon's settings.
 
-Its parameter file is read as it is. What a file leaves out is as in the file that Rolling-Bonxai ships.
+Its parameter file is read unchanged. Omitted parameters have the values of the file in Rolling-Bonxai.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from shmmap_clients.rolling_map.parameter_file import Entry, Value, read_paramet
 __all__ = ["LiveSettings", "Parameters", "Shown", "live_section", "read_parameters"]
 
 _NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
-_FRAME_BYTES: Final = 40  # in a chunk's header
+_FRAME_BYTES: Final = 40  # bytes of the frame in a chunk's header
 _VERSION_2: Final = {
     "frame_id": "map_frame",
     "base_frame_id": "robot_frame",
@@ -48,7 +48,7 @@ _VERSION_2: Final = {
     "stats.enable_stats": "viz_usage",
     "stats.quick_stats": "viz_usage",
 }
-"""By the name in version 2 (without dots: of its server that does not roll), that in version 1, if any."""
+"""Names in version 1, by name in version 2 (a name without dots is from its non-rolling server)."""
 _HERE: Final = {
     "topic_in": "give --scans",
     "occupancy_threshold": "occupied_above in [live.NAME] of the daemon's settings",
@@ -57,7 +57,7 @@ _HERE: Final = {
     "rolling.loading_policy.neighborhood.radius": "radius in [live.NAME] of the daemon's settings",
     "rolling.loading_policy.neighbourhood.radius": "radius in [live.NAME] of the daemon's settings",
 }
-"""What does the same here, where version 1 has no name for it."""
+"""Equivalents here of names in version 2 that version 1 lacks."""
 _GROUPS: Final = ("occupancy.", "sensor_model.", "rolling.", "server.", "stats.")
 _CHUNK_DIM: Final = 64
 _LIVE: Final = {"m_resolution": "resolution", "map_frame": "frame_id", "c_chunk_folder_path": "path"}
@@ -82,7 +82,7 @@ _WITHOUT_MEANING: Final = {
     "c_chunk_dim": "chunks have 64 voxels along each edge",
     "use_sor_filter": "scans are not searched for outliers",
 }
-"""Names that are known and change nothing, and why; the last two only with some values."""
+"""Known names without effect, with the reason; the last two only for some values."""
 _KINDS: Final[Mapping[type, str]] = {bool: "true or false", float: "a number", str: "text"}
 _KNOWN: Final[Mapping[str, type]] = {
     **dict.fromkeys(("map_frame", "sensor_frame", "robot_frame", "c_chunk_folder_path"), str),
@@ -100,12 +100,12 @@ class LiveSettings(msgspec.Struct, frozen=True):
     resolution
         Edge of a voxel, metres.
     occupancy
-        What a hit and a miss are worth.
+        Weights of a hit and a miss.
     frame_id
         Frame of the map.
     radius, hysteresis
-        The window: chunks around the vehicle's along each axis, and how far the vehicle has to be in another
-        chunk until its window follows, as a part of a chunk.  Rolling-Bonxai keeps the 26 neighbours, and
+        The window: number of chunks around the vehicle's along each axis, and the depth in another chunk at
+        which the window follows, as a fraction of a chunk.  Rolling-Bonxai keeps the 26 neighbours, and
         follows at once.
     path
         Directory of the map's files; empty: the daemon chooses.
@@ -113,7 +113,7 @@ class LiveSettings(msgspec.Struct, frozen=True):
     Raises
     ------
     ConfigError
-        The resolution is no positive number, or a text is too long or cannot be printed.
+        The resolution is not a positive number, or a text is too long or not printable.
     """
 
     resolution: float = 0.05
@@ -144,7 +144,7 @@ def live_section(name: str, settings: LiveSettings) -> str:
     Raises
     ------
     BadRequest
-        A map cannot have this name.
+        The name is invalid for a map.
     """
     if not _NAME.fullmatch(name):
         raise BadRequest(f"{name!r} is no name of a map", hint="use letters, digits, _ and -")
@@ -167,12 +167,12 @@ def _quoted(text: str) -> str:
 
 
 def _is_version_2(name: str) -> bool:
-    """Whether a parameter is one of version 2."""
+    """Return whether a parameter is one of version 2."""
     return name in _VERSION_2 or name.startswith(_GROUPS)
 
 
 def _version_2_advice(names: Iterable[str]) -> str:
-    """Return what to write in place of names of version 2."""
+    """Return a hint with the replacements of names of version 2."""
     said = []
     for name in names:
         if _VERSION_2.get(name):
@@ -183,7 +183,7 @@ def _version_2_advice(names: Iterable[str]) -> str:
 
 
 class Shown(NamedTuple):
-    """What a picture and the lines of progress show; the defaults are those of the file that is shipped."""
+    """Items that the picture and the progress show; defaults as in the file of Rolling-Bonxai."""
 
     occupied: bool = True
     free: bool = False
@@ -192,20 +192,20 @@ class Shown(NamedTuple):
 
 
 class Parameters(msgspec.Struct, frozen=True):
-    """What a parameter file says.
+    """Contents of a parameter file.
 
     Attributes
     ----------
     live
-        Of the map, which the daemon has: see `LiveSettings`.
+        Settings of the daemon's live map.
     scan_filter
-        Which points of a scan count.
+        Filter of a scan's points.
     shown
-        What a picture shows.
+        Items that a picture shows.
     without_effect
-        Names in the file that change nothing here, and why.
+        Names in the file that have no effect here, with the reason.
     origins
-        By name, ``FILE:LINE``.
+        ``FILE:LINE`` by name.
     """
 
     live: LiveSettings = LiveSettings()
@@ -216,7 +216,7 @@ class Parameters(msgspec.Struct, frozen=True):
 
     @property
     def warning(self) -> str:
-        """One line about all that has no effect; empty where everything has."""
+        """Return one line about all parameters without effect; empty if there are none."""
         if not self.without_effect:
             return ""
         by_reason: dict[str, list[str]] = {}
@@ -227,12 +227,12 @@ class Parameters(msgspec.Struct, frozen=True):
         )
 
     def check_map(self, live: LiveMap) -> None:
-        """Refuse a live map that differs from the file; what the file leaves out may be anything.
+        """Raise if a live map differs from the file, ignoring parameters that the file omits.
 
         Raises
         ------
         ConfigError
-            It differs.
+            The map differs from the file.
         """
         has: dict[str, float | str] = {"m_resolution": live.resolution, "map_frame": live.frame_id}
         wants: dict[str, float | str] = {
@@ -261,7 +261,7 @@ def read_parameters(path: str | os.PathLike[str]) -> Parameters:
     MapMissing
         There is no such file.
     ConfigError
-        It is no such file; a name is unknown, or one of version 2; a value is impossible.
+        The file is not a parameter file; a name is unknown or from version 2; or a value is invalid.
     """
     entries = read_parameter_file(path)
     _check_names(entries)
@@ -287,7 +287,7 @@ def read_parameters(path: str | os.PathLike[str]) -> Parameters:
 
 
 def _check_names(entries: Mapping[str, Entry]) -> None:
-    """Refuse what version 1 does not know."""
+    """Raise if a name is unknown in version 1."""
     strange = [name for name in entries if name not in _KNOWN]
     if not strange:
         return
@@ -329,13 +329,13 @@ def _made(
     entries: Mapping[str, Entry],
     **others: Any,
 ) -> Any:
-    """Make a structure of the values; an error uses the file's name for the value, and its line."""
+    """Convert the values to a structure; errors have the name and line of the value in the file."""
     given = {ours: values[name] for name, ours in names.items() if name in values}
     try:
         return kind(**given, **others)
     except ConfigError as error:
         name = next((name for name, ours in names.items() if ours == error.key), "")
-        # the struct names the upper of two that contradict each other; the file may have the other alone
+        # of two contradicting values the struct names the upper; the file may have only the lower
         entry = entries.get(name) or next(entries[name] for name in names if name in entries)
         said = error.message
         for theirs, ours in names.items():

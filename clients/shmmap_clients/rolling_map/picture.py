@@ -18,18 +18,18 @@ __all__ = ["STATES", "HeightColours", "MapContent", "map_picture"]
 
 _CHUNK_SIDE: Final = 64
 _WIDTH_PX: Final = 1200.0
-_HIGH_PX: Final = 1100.0  # the view from above, at most
+_HIGH_PX: Final = 1100.0  # greatest height of the view from above
 _MARGIN_PX: Final = 40.0
 _GAP_PX: Final = 52.0
 _HEAD_PX: Final = 92.0
-_BAR_PX: Final = 200.0  # of heights, in the legend
-_FREE: Final = (128, 156, 184, 72)  # chunks can be seen through it
-_FREE_TEXT: Final = "#d8e0e9"  # the same on white
+_BAR_PX: Final = 200.0  # length of the scale of heights in the legend
+_FREE: Final = (128, 156, 184, 72)  # transparent, so that chunks remain visible
+_FREE_TEXT: Final = "#d8e0e9"  # the same colour on white
 _PATH: Final = "#e8104a"
 _ACROSS: Final = (0, 1)  # axes of the view from above: to the right, upwards
 _SIDE: Final = (0, 2)
 _LEVELS: Final = 256
-# dark and violet below, orange above; never green or blue, which chunks are
+# dark and violet below, orange above; not green or blue, the colours of chunks
 _ANCHORS: Final = np.array(
     [
         *((44, 22, 84), (98, 28, 122), (152, 42, 118), (202, 68, 92)),
@@ -60,16 +60,16 @@ STATES: Final = {
     "clean": _Look("#2f9e44", 0.17, "clean: as on disk"),
     "saved": _Look("#9aa5b1", 0.0, "on disk only"),
 }
-"""Colours of states as Rolling-Bonxai has them; of chunks behind one another the first state is seen."""
+"""Colours of states as in Rolling-Bonxai; where chunks overlap, the first state here is shown."""
 
 
 class HeightColours:
-    """A scale of colours between two heights.
+    """Colour scale between two heights.
 
     Parameters
     ----------
     low, high
-        Metres; what is beyond has the colour of the end.
+        Heights, metres; heights beyond have the colour of the nearer end.
     """
 
     def __init__(self, low: float, high: float) -> None:
@@ -80,7 +80,7 @@ class HeightColours:
 
     @classmethod
     def of(cls, heights: NDArray[np.float64]) -> HeightColours:
-        """Make a scale for these heights, (N,) metres, but for the outermost hundredths."""
+        """Make a scale for these heights, (N,), metres, without the outermost hundredths."""
         if not len(heights):
             return cls(0.0, 1.0)
         low, high = (float(value) for value in np.percentile(heights, (1, 99)))
@@ -95,20 +95,20 @@ class HeightColours:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapContent:
-    """What is drawn; what is empty is left out.
+    """Contents of the picture; empty parts are left out.
 
     Attributes
     ----------
     resolution
         Edge of a voxel, metres.
     occupied, free
-        Middles of voxels, (N, 3), metres.
+        Centres of voxels, (N, 3), metres.
     chunks
-        Where they are, and in which states.
+        Positions and states of chunks.
     path
-        Where the sensor was, metres.
+        Positions of the sensor, metres.
     usage
-        What the map takes, in words.
+        Size of the map as text.
     """
 
     resolution: float
@@ -120,12 +120,12 @@ class MapContent:
 
 
 def map_picture(content: MapContent, title: str, note: str) -> str:
-    """Return the picture as SVG: from above with y upwards, below it from the south; both to one scale.
+    """Return the picture as SVG: a view from above, y upwards, and one from the south, to the same scale.
 
     Parameters
     ----------
     content
-        What is drawn.
+        Contents of the picture.
     title, note
         Two lines of text at the top.
     """
@@ -144,7 +144,7 @@ def map_picture(content: MapContent, title: str, note: str) -> str:
 
 
 def _extent(content: MapContent) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the corners of a box around all that is drawn, with a little air around it; metres."""
+    """Return the corners of a box around the contents, with a margin; metres."""
     half, side = content.resolution / 2, _CHUNK_SIDE * content.resolution
     chunks = (np.array([tuple(row.key) for row in content.chunks]) + 0.5) * side
     parts = (
@@ -163,14 +163,14 @@ def _extent(content: MapContent) -> tuple[NDArray[np.float64], NDArray[np.float6
 def _draw_view(
     axes: Axes, content: MapContent, colours: HeightColours, seen: tuple[int, int], name: str
 ) -> None:
-    """Draw what is seen along one axis: chunks, voxels on them, outlines and the path on top.
+    """Draw the view along one axis: chunks, voxels on them, outlines and the path on top.
 
-    Of the voxels behind one another the highest is seen; free ones only where none is occupied.
+    Where voxels overlap, the highest is shown; free voxels are shown only where none is occupied.
 
     Parameters
     ----------
     seen
-        The axes of the map that go to the right and upwards.
+        Axes of the map that point to the right and upwards.
     """
     columns = list(seen)
     axes.page.text(axes.page.margin, axes.top - 6, name, font_size=12, fill=PALE)
@@ -196,13 +196,13 @@ def _draw_view(
 
 
 def _squares(content: MapContent, seen: Sequence[int]) -> list[tuple[str, list[BoxTuple]]]:
-    """Each state with the boxes of its chunks; of chunks behind one another, the most urgent state."""
+    """Return each state with the boxes of its chunks; where chunks overlap, the most urgent state."""
     shown: dict[tuple[int, int], int] = {}
     for row in content.chunks:
         key = (row.key[seen[0]], row.key[seen[1]])
         shown[key] = min(shown.get(key, len(STATES)), list(STATES).index(row.state))
     side = _CHUNK_SIDE * content.resolution
-    # one that is drawn later covers the border of one before: the most urgent last
+    # a later box covers borders of earlier ones, so that the most urgent state is last
     found = []
     for rank, state in reversed(list(enumerate(STATES))):
         places = [place for place, at in shown.items() if at == rank]
@@ -212,7 +212,7 @@ def _squares(content: MapContent, seen: Sequence[int]) -> list[tuple[str, list[B
 
 
 def _draw_legend(axes: Axes, y: float, content: MapContent, colours: HeightColours) -> float:
-    """Write states and path, and below them heights and the scale; return the last base line."""
+    """Draw the legend: states and path, then heights and scale; return the last baseline."""
     page, states = axes.page, {row.state for row in content.chunks}
     entries = [
         (swatch(**look.area(), **look.outline()), look.text)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Serves the daemon's map to ROS 2 nodes that know nothing of shmmap, in place of Autoware's map loader."""
+"""Serves the daemon's map to unmodified ROS 2 nodes, in place of Autoware's map loader."""
 
 from __future__ import annotations
 

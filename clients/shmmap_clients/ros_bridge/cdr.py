@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages as bytes, written by hand: CDR (OMG, Common Data Representation), version 1, little-endian.
+"""Hand-written encoder of messages: CDR (OMG, Common Data Representation), version 1, little-endian.
 
-Every number stands at a multiple of its own size, counted from the end of the four bytes of encapsulation; a
-text is its length with a closing zero byte, then its bytes; a sequence is its length, then its elements.
+Every number is aligned to its own size, counted from the end of the four bytes of encapsulation.  A text is
+its length including a closing zero byte, then its bytes.  A sequence is its length, then its elements.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Final
 __all__ = ["MAX_BYTES", "CdrWriter", "Content"]
 
 MAX_BYTES: Final = 2**31 - 1
-"""Largest sample that CycloneDDS sends (``Internal/MaxSampleSize``), 2 GiB: lengths in it are of 32 bits."""
+"""Largest sample that CycloneDDS sends (``Internal/MaxSampleSize``), 2 GiB; its lengths have 32 bits."""
 
 _ENCAPSULATION: Final = b"\x00\x01\x00\x00"  # CDR_LE, no options
 
@@ -22,29 +22,29 @@ Fill = Callable[[memoryview], None]
 
 
 class Content(bytearray):
-    """The bytes of a sample. They are as many as a sample needs, so that `cyclonedds` copies them no more."""
+    """The bytes of a sample, already of the required length, so that `cyclonedds` does not copy them."""
 
     def ljust(self, width: int, fill: bytes = b"\0") -> Content:  # type: ignore[override]
-        """Return itself, if it is long enough."""
+        """Return this object, if it is long enough."""
         return self if len(self) >= width else Content(super().ljust(width, fill))
 
 
 class CdrWriter:
-    """Collects a message's parts; what is large is written once, straight to its place.
+    """Writer of a message; large parts are written once, directly to their place in the sample.
 
-    Numbers and texts are kept until `content` is asked for. Then the sample gets all its memory at once, and
-    each `blob` writes its bytes into it.
+    Numbers and texts are kept until `content` is called. It allocates the whole sample at once, and each
+    `blob` writes its bytes into the sample.
     """
 
     def __init__(self) -> None:
         self._large: list[tuple[int, int, Fill]] = []  # place, size and writer of each blob
-        self._small: list[tuple[int, bytearray]] = []  # places of the bytes in between
+        self._small: list[tuple[int, bytearray]] = []  # place and bytes of the parts in between
         self._now = bytearray()
-        self._start = 0  # where `_now` begins
+        self._start = 0  # place of the beginning of `_now`
 
     @property
     def size(self) -> int:
-        """Bytes so far, without the encapsulation."""
+        """Number of bytes so far, without the encapsulation."""
         return self._start + len(self._now)
 
     def _pack(self, form: str, align: int, *values: float) -> None:
@@ -52,7 +52,7 @@ class CdrWriter:
         self._now += struct.pack(form, *values)
 
     def boolean(self, value: bool) -> None:
-        """Append a truth value, one byte."""
+        """Append a bool, one byte."""
         self._pack("<B", 1, value)
 
     def uint8(self, value: int) -> None:
@@ -98,30 +98,30 @@ class CdrWriter:
             self.text(one)
 
     def prepared(self, data: bytes) -> None:
-        """Append bytes that were written before, by another writer, to stand at a multiple of four."""
+        """Append the bytes of another writer, aligned to four."""
         self._now += b"\0" * (-self.size % 4)
         self._now += data
 
     def blob(self, nbytes: int, fill: Fill) -> None:
-        """Append ``nbytes`` bytes, which ``fill`` writes when it is called with their place."""
+        """Append ``nbytes`` bytes; ``fill`` writes them later, when it is called with their memory."""
         self._small.append((self._start, self._now))
         self._large.append((self.size, nbytes, fill))
         self._start = self.size + nbytes
         self._now = bytearray()
 
     def content(self, over: Content | None = None) -> Content:
-        """Return the sample: encapsulation, message, and up to three bytes to a multiple of four.
+        """Return the sample: encapsulation, message, and padding to a multiple of four bytes.
 
         Parameters
         ----------
         over
-            A sample that has been sent: its memory is used again, so that none has to be cleared first. What
-            is announced then has to be written whole.
+            A sample that has been sent, whose memory is reused without clearing. Each ``fill`` then has to
+            write all its bytes.
 
         Raises
         ------
         ValueError
-            It has more bytes than DDS can send.
+            The sample is larger than DDS can send.
         """
         size = len(_ENCAPSULATION) + self.size
         if size > MAX_BYTES:

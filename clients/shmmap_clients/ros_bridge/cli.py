@@ -46,7 +46,7 @@ of this daemon runs in this domain."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Serve ROS nodes until a signal comes, and return the exit code."""
+    """Serve ROS nodes until a signal arrives, and return the exit code."""
     return run_command(
         _NAME,
         "Serve the daemon's map to ROS 2 nodes as Autoware's pointcloud_map_loader does, over CycloneDDS."
@@ -175,7 +175,7 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _live_map(args: argparse.Namespace, client: Client) -> str:
-    """Which live map to serve; empty: none."""
+    """Return the name of the live map to serve; empty for none."""
     from shmmap import BadRequest
 
     there = [row.name for row in client.live_maps()]

@@ -2,7 +2,7 @@
 """Services and topics of a live map: the thread that asks the daemon for voxels.
 
 Rolling-Bonxai planned a service for voxels in memory and one for saved chunks; ``bonxai_msgs`` has the types.
-Voxels are named by their indices there, as they are here: ``floor(position / resolution)``.
+Both programs use the same indices of voxels: ``floor(position / resolution)``.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ LIVE_SERVICES: Final[dict[str, tuple[ServiceKind, str, str]]] = {
     "get_saved_occupied_voxels": (OCCUPIED, "occupied", "disk"),
     "get_saved_free_voxels": (FREE, "free", "disk"),
 }
-"""By the last part of a service's name: types, kind of voxels, and where they are looked for."""
+"""Types, kind of voxels and place of the search, by the last part of the service's name."""
 
 
 def _voxel_reply(live: LiveMap, message: Any, kind: str, scope: str) -> Content:
     """Return a reply with all voxels of a kind.
 
-    The counts are those of the daemon's list of chunks: for ``disk`` those of every chunk, a chunk in memory
-    as it is there. ``memory_mb`` is what the map takes in memory, or its files on the disk, in MiB.
+    The counts are from the daemon's list of chunks. For ``disk`` they include every chunk, and chunks in
+    memory with their state there. ``memory_mb`` is the size of the map in memory, or of its files, in MiB.
 
     Raises
     ------
@@ -61,7 +61,7 @@ def _voxel_reply(live: LiveMap, message: Any, kind: str, scope: str) -> Content:
 
 
 def _failed_reply(message: Any) -> Content:
-    """Return a reply without voxels, and without success."""
+    """Return a reply without voxels that reports failure."""
     writer = _head(None, message, np.empty((0, 3), np.int32))
     writer.uint64(0, 0)
     writer.float32(0.0, 0.0)
@@ -70,7 +70,7 @@ def _failed_reply(message: Any) -> Content:
 
 
 def _head(live: LiveMap | None, message: Any, indices: NDArray[np.int32]) -> CdrWriter:
-    """Write a reply as far as its ``bonxai_msgs/VoxelGrid``."""
+    """Write a reply up to the end of its ``bonxai_msgs/VoxelGrid``."""
     writer = CdrWriter()
     writer.uint64(message.client)
     writer.int64(message.number)
@@ -90,7 +90,7 @@ def _head(live: LiveMap | None, message: Any, indices: NDArray[np.int32]) -> Cdr
 
 
 class _Axis:
-    """One column of the indices, to be written."""
+    """Writer of one column of the indices."""
 
     def __init__(self, indices: NDArray[np.int32], axis: int) -> None:
         self._values = indices[:, axis]
@@ -100,7 +100,7 @@ class _Axis:
 
 
 def _voxel_cloud(live: LiveMap, kind: str) -> Content:
-    """Return the middles of all voxels of a kind in memory as a ``PointCloud2``, in the map's frame.
+    """Return the centres of all voxels of a kind in memory as a ``PointCloud2``, in the map's frame.
 
     Raises
     ------
@@ -114,18 +114,18 @@ def _voxel_cloud(live: LiveMap, kind: str) -> Content:
 
 
 class LiveWorker(Worker):
-    """Answers with voxels, and publishes them where a node subscribes and something has changed.
+    """Worker that answers with voxels, and publishes changed ones while a node subscribes.
 
     Parameters
     ----------
     live
-        The map, of a client that serves nothing else.
+        The live map, on a client that only this worker uses.
     clouds
         Writers of the two topics by kind of voxels, ``occupied`` and ``free``.
     listening
-        Where requests come.
+        Source of requests.
     every_s
-        How often it is looked whether to publish.
+        Interval of checks whether to publish, seconds.
     """
 
     def __init__(
@@ -153,7 +153,7 @@ class LiveWorker(Worker):
         return _failed_reply(message)
 
     def tick(self) -> None:
-        """Publish what has changed, or what a new subscriber asks for."""
+        """Publish changed voxels, and all voxels for a new subscriber."""
         for kind, writer in self._clouds.items():
             readers = frozenset(writer.get_matched_subscriptions())
             change = self._live.status().change if readers else 0

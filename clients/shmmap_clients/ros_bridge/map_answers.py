@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Answers to Autoware's three requests for cells, as its map loader gives them.
+"""Answers to Autoware's three requests for cells, as from its map loader.
 
-- Partial and differential answers are in the order of ids, selected ones in the order asked for, with
-  repetitions; an unknown id is left out.
-- ``ids_to_remove`` has what the client said it has and does not need any more, unknown ids included, in the
+- Partial and differential answers are in the order of ids.  Selected ones are in the order of the request,
+  with repetitions.  Unknown ids are left out.
+- ``ids_to_remove`` lists the ids of the request that are no longer needed, unknown ones included, in the
   order given.
-- The header's frame is the map's, its time is zero; the header of each cloud is empty.
+- The header has the map's frame and time zero; the header of each cloud is empty.
 
-Different, because the message says nothing of it: a cell that cannot be loaded is left out, where Autoware
-sends it empty and the client believes that nothing is there; an id that was given twice is not removed for
-being there twice; and a cell whose file has changed since the client got it is sent again.
+Three differences from Autoware: a cell that cannot be loaded is left out, while Autoware sends it empty, so
+that the client takes it for free space; an id that a request repeats is not removed for that reason; and a
+cell whose file has changed since it was sent is sent again.
 
-What is more than the daemon answers at once is asked for in slices.
+Requests above the daemon's limits are split into slices.
 
-Autoware's request names cells, but not their versions: a file that has changed would never reach a client
-that has its cell already.  So the bridge remembers what each client was sent (`Requesters`), and sends a
+Autoware's request names cells, but not their versions, so that a changed file would never reach a client that
+already has the cell.  So the bridge remembers the versions sent to each client (`Requesters`), and sends a
 changed cell again under its id.
 """
 
@@ -38,7 +38,7 @@ from shmmap_clients.ros_bridge.worker import StillLoading, TooLarge, no_followup
 __all__ = ["MAX_REQUESTERS", "Catalogue", "MapAnswers", "RecentCells", "Requesters", "sensible", "touches"]
 
 MAX_REQUESTERS: Final = 256
-"""Clients that are remembered; beyond that, the one with the oldest request is forgotten."""
+"""Largest number of remembered clients; the one with the oldest request is forgotten first."""
 
 
 class Catalogue:
@@ -51,7 +51,7 @@ class Catalogue:
     versions : dict
         Version of each cell's points by id.
     map_version : int or None
-        Which state of the map this is; None before the first `refresh`.
+        Version of the map; None before the first `refresh`.
     """
 
     def __init__(self) -> None:
@@ -60,7 +60,7 @@ class Catalogue:
         self.map_version: int | None = None
 
     def refresh(self, client: Client) -> None:
-        """Fetch what has changed.
+        """Fetch the changes of the map.
 
         Raises
         ------
@@ -83,7 +83,7 @@ class Catalogue:
         return np.array([cell.box for cell in self.cells.values()], np.float64).reshape(-1, 4)
 
     def message(self, frame_id: str, stamp_ns: int) -> Content:
-        """Return the list as ``autoware_map_msgs/PointCloudMapMetaData``."""
+        """Return the list of cells as ``autoware_map_msgs/PointCloudMapMetaData``."""
         writer = CdrWriter()
         writer.int32(stamp_ns // 10**9)
         writer.uint32(stamp_ns % 10**9)
@@ -96,12 +96,12 @@ class Catalogue:
 
 
 class Requesters:
-    """Versions by client and cell.
+    """Versions that were sent, by client and cell.
 
     Parameters
     ----------
     most
-        How many clients are remembered.
+        Largest number of remembered clients.
     """
 
     def __init__(self, most: int = MAX_REQUESTERS) -> None:
@@ -114,20 +114,20 @@ class Requesters:
     def held(
         self, requester: str, ids: Iterable[str], current: Mapping[str, int]
     ) -> list[tuple[str, int | None]]:
-        """Return what a client has: ids with versions.
+        """Return the cells that a client has: ids with versions.
 
         Parameters
         ----------
         requester
             The client.
         ids
-            What it says it has.
+            Ids that the client reports to have.
         current
-            Versions that cells have now: what was not sent by us counts as current, as it does in Autoware.
+            Present versions of cells; a cell not sent by this bridge counts as current, as in Autoware.
 
         Returns
         -------
-        One for each id, unknown ones included: in the order given, without repetitions.
+        One pair for each id, unknown ones included, in the order given, without repetitions.
         """
         known = self._versions.get(requester, {})
         return [(one, known.get(one, current.get(one))) for one in dict.fromkeys(ids)]
@@ -139,12 +139,12 @@ class Requesters:
         removed: Collection[str],
         sent: Mapping[str, int],
     ) -> None:
-        """Remember what a client has after an answer.
+        """Record the cells that a client has after an answer.
 
         Parameters
         ----------
         held, removed, sent
-            What it had; what it was asked to drop; the versions of what it was sent.
+            Cells it had before, ids it was asked to drop, and versions of the cells sent to it.
         """
         gone = set(removed)
         versions = {one: version for one, version in held if version is not None and one not in gone}
@@ -155,7 +155,7 @@ class Requesters:
             self._versions.popitem(last=False)
 
     def keep_only(self, alive: Collection[str]) -> None:
-        """Forget every client that is not among these."""
+        """Forget all clients except these."""
         for requester in [one for one in self._versions if one not in alive]:
             del self._versions[requester]
 
@@ -164,12 +164,12 @@ _MAX_RECENT_BYTES: Final = 64 << 20
 _KEPT_S: Final = 2.0
 _PAUSE_S: Final = 0.2
 _TURN_S: Final = 1.0
-"""How long others wait for cells that one client's request has loaded."""
+"""Longest time that one client's request may wait for loading while other clients wait, seconds."""
 _SLICE_CELLS: Final = 10_000
 _SLICE_BYTES: Final = 1 << 20
 """Cells and bytes of one request to the daemon, which accepts at most 20 000 cells and 4 MiB."""
 _MAX_CELLS: Final = 100_000
-"""Of one answer, repetitions included."""
+"""Largest number of cells in one answer, repetitions included."""
 _NAMED: Final = 3
 _REUSED_BYTES: Final = 16 << 20
 _LAYOUTS: Final = 64
@@ -177,7 +177,7 @@ Log = Callable[[str], None]
 
 
 def sensible(area: Any) -> AutowareSquare | None:
-    """Return the square that an ``AreaInfo`` means; None where only `touches` knows."""
+    """Return the square of an ``AreaInfo``; None for unusual values, which only `touches` handles."""
     x, y, radius = area.center_x, area.center_y, area.radius
     if not all(map(math.isfinite, (x, y, radius))) or radius < 0:
         return None
@@ -185,33 +185,33 @@ def sensible(area: Any) -> AutowareSquare | None:
 
 
 def touches(area: Any, boxes: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which of ``boxes``, (N, 4) min_x min_y max_x max_y in metres, any ``AreaInfo`` touches, (N,).
+    """Return a mask (N,) of the ``boxes``, (N, 4) min_x min_y max_x max_y, metres, that an area touches.
 
     Autoware's test (``cylinder_and_box_overlap_exists``) is a square of half-side ``radius`` with closed
-    borders, on float32 numbers in double arithmetic.  `shmmap.AutowareSquare` is that square for every area
-    that makes sense.  Autoware also answers the others: a negative radius shrinks each box, infinity takes
-    everything, and what is no number touches nothing.
+    borders, on float32 numbers in double arithmetic.  `shmmap.AutowareSquare` is that square for every valid
+    area.  Autoware also answers invalid ones: a negative radius shrinks each box, infinity selects all boxes,
+    and NaN none.
     """
     place = np.array([area.center_x, area.center_y], np.float64)
     radius = float(area.radius)
     low, high = (boxes[:, part].astype(np.float32).astype(np.float64) for part in ([0, 1], [2, 3]))
     with np.errstate(invalid="ignore"):
         inside: NDArray[np.bool_] = np.all((low - radius <= place) & (place <= high + radius), axis=1)
-        # where x and radius are infinite and y is no number a corner is within the radius
+        # with infinite x and radius, and NaN as y, a corner is within the radius
         for corner in (low, high, np.stack([low[:, 0], high[:, 1]], 1), np.stack([high[:, 0], low[:, 1]], 1)):
             inside |= np.hypot(*(place - corner).T) <= radius
     return inside
 
 
 class RecentCells:
-    """Cells of recent answers, at most 64 MiB.
+    """Cache of the cells of recent answers, at most 64 MiB.
 
-    Mapping a cell takes as long as sending it, and other clients often ask for the same one.  After two
-    seconds without a request all are dropped, so that the daemon may evict them.
+    Mapping a cell takes as long as sending it, and other clients often request the same one.  After two
+    seconds without a request, all cells are dropped, so that the daemon may evict them.
     """
 
     def __init__(self) -> None:
-        self._cells: OrderedDict[tuple[str, int], Cell] = OrderedDict()  # the newest last
+        self._cells: OrderedDict[tuple[str, int], Cell] = OrderedDict()  # newest last
         self._bytes = 0
         self._until_s = 0.0
 
@@ -219,7 +219,7 @@ class RecentCells:
         return len(self._cells)
 
     def kept(self, cells: Iterable[Cell]) -> list[Cell]:
-        """Keep these cells; returns them, those that were kept before with the arrays that they have made."""
+        """Keep these cells and return them; cells kept before are returned as the same objects."""
         found = []
         for cell in cells:
             key = cell.id, cell.version
@@ -236,7 +236,7 @@ class RecentCells:
         return found
 
     def release_idle(self) -> bool:
-        """Release all cells if there was no request for two seconds; returns whether that is so."""
+        """Release all cells after two seconds without a request; return whether this was the case."""
         if not self._cells or time.monotonic() < self._until_s:
             return False
         self._cells.clear()
@@ -245,20 +245,20 @@ class RecentCells:
 
 
 class MapAnswers:
-    """Answers requests with the daemon's cells.
+    """Builder of answers from the daemon's cells.
 
     Parameters
     ----------
     client
-        Of the daemon.
+        Client of the daemon.
     catalogue
-        The map's list.
+        List of the map's cells.
     requesters
-        What each client has.
+        Versions that each client has.
     wait_s
-        How long the daemon may take to load what is not in memory; what is missing then is left out.
+        Time for the daemon to load cells, seconds; cells missing after it are left out.
     log
-        Takes a line about what is left out.
+        Called with a line about omitted cells.
     """
 
     def __init__(
@@ -272,23 +272,23 @@ class MapAnswers:
         self._recent = RecentCells()
         self._layouts: dict[Hashable, CloudLayout] = {}
         self._until_s = 0.0
-        self._sent: Content | None = None  # the reply before: its memory is used again
+        self._sent: Content | None = None  # the last reply, whose memory is reused
 
     def answer(
         self, message: Any, requester: str, begun_s: float | None = None
     ) -> tuple[Content, Callable[[], None]]:
-        """Return a reply, and what to call when it was sent.
+        """Return a reply, and a function to call once it has been sent.
 
-        It has to be sent before the next one is asked for.  ``begun_s`` is when this request was tried first.
+        Send it before the next call.  ``begun_s`` is the time of the first attempt at this request.
 
         Raises
         ------
         StillLoading
-            Not all is there yet: it is to be tried again, others first.
+            Some cells are not loaded yet: try again after the requests of other clients.
         TooLarge
-            No reply can hold it.
+            The cells do not fit into one reply.
         ShmmapError
-            The daemon does not answer, or refuses; nothing has changed then.
+            The daemon does not answer, or refuses; the state is then unchanged.
         """
         self._until_s = (time.monotonic() if begun_s is None else begun_s) + self._wait_s
         if isinstance(message, GetDifferentialRequest):
@@ -306,7 +306,7 @@ class MapAnswers:
         return self._reply(message, cells), no_followup
 
     def empty(self, message: Any) -> Content:
-        """Return the reply that has nothing, for a request that the daemon refuses."""
+        """Return the empty reply, for a request that the daemon refuses."""
         return self._reply(message, ())
 
     def _differential(
@@ -333,7 +333,7 @@ class MapAnswers:
         return self._reply(message, cells, removed), done
 
     def _is_small(self, area: Any) -> bool:
-        """Whether the daemon answers with the cells of an area at once."""
+        """Return whether the daemon answers a request for an area without slices."""
         few = len(self._catalogue.cells) <= _SLICE_CELLS
         return few or int(touches(area, self._catalogue.boxes()).sum()) <= _SLICE_CELLS
 
@@ -343,7 +343,7 @@ class MapAnswers:
         return [one for one, take in zip(self._catalogue.cells, inside, strict=True) if take]
 
     def _known(self, ids: Sequence[str]) -> Sequence[str]:
-        """Return the ids; of very many only those of the map: answers leave out the others anyway."""
+        """Return the ids; of a long list only those in the map, since answers omit the others anyway."""
         if _is_one_slice(ids):
             return ids
         self._catalogue.refresh(self._client)
@@ -359,7 +359,7 @@ class MapAnswers:
         return found
 
     def _all(self, ask: Callable[[float], CellSet]) -> CellSet:
-        """Ask the daemon; what is missing although it has had time is logged, and left out."""
+        """Ask the daemon for cells; log and omit those that are still missing after the timeout."""
         left_s = max(0.0, self._until_s - time.monotonic())
         cells = ask(min(left_s, _TURN_S))
         if left_s > _TURN_S:
@@ -375,7 +375,7 @@ class MapAnswers:
         return cells
 
     def release_idle(self) -> None:
-        """Release cells that no client has asked for lately."""
+        """Release cells that no client has requested lately."""
         if self._recent.release_idle():
             self._client.release()
 
@@ -410,18 +410,18 @@ class MapAnswers:
             writer.text(cell.id)
             write_cloud(writer, columns, cell.origin, layout)
             writer.float32(*cell.box)
-            if writer.size > MAX_BYTES:  # repetitions of a large cell: thousands more would take long
+            if writer.size > MAX_BYTES:  # stop early: thousands of repetitions take long
                 raise TooLarge(
                     f"an answer of more than {MAX_BYTES} bytes", hint="ask for fewer cells at once"
                 )
 
 
 def _is_one_slice(ids: Sequence[str]) -> bool:
-    return len(ids) <= _SLICE_CELLS and sum(map(len, ids)) <= _SLICE_BYTES // 4  # bytes of a character
+    return len(ids) <= _SLICE_CELLS and sum(map(len, ids)) <= _SLICE_BYTES // 4  # up to 4 bytes a character
 
 
 def _slices(ids: Sequence[str]) -> Iterator[Sequence[str]]:
-    """Ids in parts, in their order, each of which is one request."""
+    """Split ids, in order, into parts of one request each."""
     begin = nbytes = 0
     for at, one in enumerate(ids):
         nbytes += 4 * len(one)

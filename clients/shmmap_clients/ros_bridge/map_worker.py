@@ -29,32 +29,31 @@ def _whole_map(
 ) -> Content:
     """Return all points of the map as a ``PointCloud2`` in the map's frame, for ``/map/pointcloud_map``.
 
-    Each cell is released before the next one is asked for, so the daemon's budget need not hold the map.  The
-    bytes themselves are held twice for a moment, and once by DDS as long as the bridge runs: it is for small
-    maps.
+    Each cell is released before the next one is requested, so the daemon's budget need not hold the map.  The
+    message is briefly in memory twice, and DDS keeps one copy while the bridge runs: use it for small maps.
 
-    The fields are those of the first cell that has points. Another cell's that it does not have are left out,
-    and are zero where it lacks one; Autoware puts the bytes one after another, whatever they mean.
+    The fields are those of the first cell with points. Additional fields of other cells are left out, and
+    fields that a cell lacks are zero. Autoware instead joins the bytes of all cells, whatever their fields.
 
     Parameters
     ----------
     client
-        Of the daemon.
+        Client of the daemon.
     cells
-        All of the map, in the order in which their points come.
+        All cells of the map, in the order of their points in the message.
     stamp_ns
         Time in the header.
     max_bytes
-        Size of the message at most.
+        Largest size of the message.
     wait_s
-        How long a cell may take to load.
+        Time for a cell to load, seconds.
 
     Raises
     ------
     BadRequest
-        The map has more points than that; the message says how many bytes it takes, about.
+        The map has more bytes than that; the error names its approximate size.
     LoadFailed
-        A cell cannot be loaded: a map with a hole would not be the whole one.
+        A cell cannot be loaded, so that the map would have a hole.
     """
     layout: CloudLayout | None = None
     points, data = 0, bytearray()
@@ -97,25 +96,25 @@ def _copy(place: memoryview, data: bytearray) -> None:
 
 
 class MapWorker(Worker):
-    """Answers with cells, and publishes the list of cells and the whole map, again when the map changes.
+    """Worker that answers with cells, and publishes the list of cells and the whole map after each change.
 
     Parameters
     ----------
     client
-        Of the daemon; only this worker uses it.
+        Client of the daemon, used only by this worker.
     metadata, whole
-        Writers of the two topics; ``whole`` is None where the whole map is not published.
+        Writers of the two topics; ``whole`` is None if the whole map is not published.
     listening
-        Where requests come.
+        Source of requests.
     wait_s
-        How long cells may take to load.
+        Time for cells to load, seconds.
     whole_bytes
-        Size of the whole map at most.
+        Largest size of the whole map.
 
     Attributes
     ----------
     alive
-        Names of the clients there are; the others are forgotten.
+        Names of the present clients; all others are forgotten.
     """
 
     def __init__(
@@ -139,12 +138,12 @@ class MapWorker(Worker):
         self._catalogue = Catalogue()
         self._requesters = Requesters()
         self._answers = MapAnswers(client, self._catalogue, self._requesters, wait_s, log)
-        self._published: int | None = None  # which state of the map
+        self._published: int | None = None  # version of the map
         self.alive: Collection[str] | None = None
 
     @property
     def requesters(self) -> int:
-        """How many clients are remembered."""
+        """Number of remembered clients."""
         return len(self._requesters)
 
     def begin(self) -> None:
@@ -161,7 +160,7 @@ class MapWorker(Worker):
     def answer(self, message: Any, request: Request) -> Answer:
         """Return a reply with cells."""
         if self._client.disconnected_since is not None:
-            # a request for cells has longer than this to find out that the daemon is away
+            # requests for cells wait longer before they find that the daemon is away
             self._catalogue.refresh(self._client)
         return self._answers.answer(message, request.requester.name, request.tries.begun_s)
 
@@ -170,7 +169,7 @@ class MapWorker(Worker):
         return self._answers.empty(message)
 
     def tick(self) -> None:
-        """Publish again if the map has changed; forget clients that have gone."""
+        """Publish again if the map has changed; forget clients that have left."""
         if self.alive is not None:
             self._requesters.keep_only(self.alive)
         self._answers.release_idle()
@@ -179,7 +178,7 @@ class MapWorker(Worker):
             return
         try:
             self._publish()
-        except BadRequest as error:  # it has grown: what was published stays
+        except BadRequest as error:  # the map has grown too large: subscribers keep the last one
             self._log(str(error))
             self._published = self._catalogue.map_version
 

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS 2 messages and services as IDL, and how they become samples of DDS and back.
+"""ROS 2 messages and services as IDL, and their conversion to and from samples of DDS.
 
 The packages are ``builtin_interfaces``, ``std_msgs``, ``sensor_msgs``; ``autoware_map_msgs``, read at version
 1.12; and ``bonxai_msgs``, as Rolling-Bonxai's own packages have it since version 2.
 
 A request and a reply begin with 16 bytes that rmw_cyclonedds_cpp puts in front of the message (its
-``serdata.hpp``): which client asked, and its number of the request.  The server sends both back, and the
-client takes the reply that has its own.  Each type here that has them is a request or a reply.
+``serdata.hpp``): the id of the client, and the client's number of the request.  The server returns both, and
+a client accepts only replies with its own.  The types here with these two fields are requests and replies.
 
 Replies with points are written by hand (`shmmap_clients.ros_bridge.cdr`): the serializer of `cyclonedds`
 handles each byte of a sequence in Python.
@@ -57,32 +57,32 @@ _Sample = TypeVar("_Sample")
 
 @dataclass
 class Damaged:
-    """What came instead of a message: bytes that are no message of its type.
+    """Stand-in for a received message whose bytes are invalid for its type.
 
     Attributes
     ----------
     reason
-        What is wrong with them.
+        Why the bytes are invalid.
     """
 
     reason: str
 
 
 def sample(kind: type[_Sample]) -> type[_Sample]:
-    """Let a class of messages be sent as bytes that were made ready, and survive bytes that are no message.
+    """Class decorator: send prepared bytes as a message, and tolerate invalid bytes on reception.
 
-    It is laid out as all of ROS: fields one after another and nothing else (``final``).
+    The layout is that of all ROS types: fields one after another, without extensions (``final``).
     """
     kind.serialize = _serialize  # type: ignore[attr-defined]
     kind.deserialize = classmethod(_deserialize)  # type: ignore[attr-defined]
-    kind.ready = None  # type: ignore[attr-defined]  # no annotation: it is no field of the message
+    kind.ready = None  # type: ignore[attr-defined]  # no annotation, so that it is no field of the message
     return final(kind)  # type: ignore[no-any-return]
 
 
 def _serialize(
     self: Any, buffer: Any = None, endianness: Any = None, use_version_2: bool | None = None
 ) -> bytes | bytearray:
-    """Return those bytes, or make some of the fields."""
+    """Return the prepared bytes, or else the serialized fields."""
     made: bytes | bytearray = (
         self.__idl__.serialize(self, buffer=buffer, endianness=endianness, use_version_2=use_version_2)
         if self.ready is None
@@ -94,7 +94,7 @@ def _serialize(
 def _deserialize(cls: Any, data: bytes, has_header: bool = True, use_version_2: bool | None = None) -> Any:
     """Return the message, or `Damaged`.
 
-    Cyclone has dropped before what does not fit the type; texts that are not UTF-8 are left, for one.
+    CycloneDDS already drops bytes that do not fit the type; texts that are not UTF-8 remain, for example.
     """
     try:
         return cls.__idl__.deserialize(data, has_header=has_header, use_version_2=use_version_2)
@@ -111,12 +111,12 @@ def ready_made(kind: type[_Sample], content: bytearray) -> _Sample:
 
 @dataclass(frozen=True, slots=True)
 class ServiceKind:
-    """A service's types.
+    """Types of a service.
 
     Attributes
     ----------
     name
-        As ROS writes it, ``autoware_map_msgs/srv/GetPartialPointCloudMap``.
+        Name in ROS notation, ``autoware_map_msgs/srv/GetPartialPointCloudMap``.
     request, reply
         Classes of the messages.
     """
@@ -129,7 +129,7 @@ class ServiceKind:
 @dataclass
 @sample
 class Time(IdlStruct, typename="builtin_interfaces::msg::dds_::Time_"):
-    """A moment: seconds and nanoseconds since 1970."""
+    """A point in time: seconds and nanoseconds since 1970."""
 
     sec: int32
     nanosec: uint32
@@ -138,7 +138,7 @@ class Time(IdlStruct, typename="builtin_interfaces::msg::dds_::Time_"):
 @dataclass
 @sample
 class Header(IdlStruct, typename="std_msgs::msg::dds_::Header_"):
-    """When, and in which frame."""
+    """Time and frame of a message."""
 
     stamp: Time
     frame_id: str
@@ -147,7 +147,7 @@ class Header(IdlStruct, typename="std_msgs::msg::dds_::Header_"):
 @dataclass
 @sample
 class PointField(IdlStruct, typename="sensor_msgs::msg::dds_::PointField_"):
-    """One value of each point: where in the point, of which type (1 int8 to 8 float64), how many."""
+    """One field of each point: offset in bytes, type (1 int8 to 8 float64), number of values."""
 
     name: str
     offset: uint32
@@ -174,7 +174,7 @@ class PointCloud2(IdlStruct, typename="sensor_msgs::msg::dds_::PointCloud2_"):
 @dataclass
 @sample
 class AreaInfo(IdlStruct, typename="autoware_map_msgs::msg::dds_::AreaInfo_"):
-    """An area around a place, metres in the map frame."""
+    """An area around a position, metres, map frame."""
 
     center_x: float32
     center_y: float32
@@ -206,7 +206,7 @@ class CellMetaDataWithID(
 @dataclass
 @sample
 class CellWithID(IdlStruct, typename="autoware_map_msgs::msg::dds_::PointCloudMapCellWithID_"):
-    """A cell."""
+    """A cell with its points."""
 
     cell_id: str
     pointcloud: PointCloud2
@@ -289,7 +289,7 @@ class GetSelectedRequest(
 class GetSelectedResponse(
     IdlStruct, typename="autoware_map_msgs::srv::dds_::GetSelectedPointCloudMap_Response_"
 ):
-    """The cells, in the order asked for."""
+    """The cells, in the order of the request."""
 
     client: uint64
     number: int64
@@ -332,7 +332,7 @@ class VoxelGrid(IdlStruct, typename="bonxai_msgs::msg::dds_::VoxelGrid_"):
 @dataclass
 @sample
 class GetOccupiedRequest(IdlStruct, typename="bonxai_msgs::srv::dds_::GetOccupiedVoxels_Request_"):
-    """All occupied voxels; ROS gives messages without fields one byte."""
+    """A request for all occupied voxels; a ROS message without fields has one byte."""
 
     client: uint64
     number: int64
@@ -342,7 +342,7 @@ class GetOccupiedRequest(IdlStruct, typename="bonxai_msgs::srv::dds_::GetOccupie
 @dataclass
 @sample
 class GetOccupiedResponse(IdlStruct, typename="bonxai_msgs::srv::dds_::GetOccupiedVoxels_Response_"):
-    """The voxels; the map's counts; ``occupancy_ratio`` is occupied / (occupied + free)."""
+    """The voxels and the map's counts; ``occupancy_ratio`` is occupied / (occupied + free)."""
 
     client: uint64
     number: int64
@@ -357,7 +357,7 @@ class GetOccupiedResponse(IdlStruct, typename="bonxai_msgs::srv::dds_::GetOccupi
 @dataclass
 @sample
 class GetFreeRequest(IdlStruct, typename="bonxai_msgs::srv::dds_::GetFreeVoxels_Request_"):
-    """All free voxels."""
+    """A request for all free voxels."""
 
     client: uint64
     number: int64

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`RosBridge`: the node ``pointcloud_map_loader`` of a ROS 2 system, with the daemon's map behind it.
+"""`RosBridge`: the node ``pointcloud_map_loader`` of a ROS 2 system, which serves the daemon's map.
 
-Three threads: one answers with cells, one with voxels where there is a live map, and one with the
-parameters. Each takes its requests itself. The last one also looks every second which clients there are.
+Three threads: one answers with cells, one with voxels if there is a live map, and one with parameters.
+Each thread takes its own requests. The last one also updates the list of present clients every second.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ NAMES: Final[Mapping[str, str]] = {
     "whole": "pointcloud_map",
     "live": "/shmmap/live",
 }
-"""Names of services and topics in the node's namespace, unless `BridgeSettings.names` has another."""
+"""Default names of services and topics in the node's namespace; `BridgeSettings.names` overrides them."""
 _KINDS: Final = {"partial": PARTIAL, "differential": DIFFERENTIAL, "selected": SELECTED}
 _LOOK_S: Final = 1.0
 _ADVICE: Final = "start it with RMW_IMPLEMENTATION=rmw_cyclonedds_cpp"
@@ -66,22 +66,22 @@ _Self = TypeVar("_Self", bound="RosBridge")
 
 
 class BridgeSettings(msgspec.Struct, frozen=True):
-    """How the bridge appears in ROS.
+    """Settings of the bridge in ROS.
 
     Attributes
     ----------
     domain
         DDS domain, ``ROS_DOMAIN_ID``.
     node, namespace
-        The node's name, and where names are that do not begin with a slash.
+        Name of the node, and namespace of names that do not begin with a slash.
     names
-        Other names than those of `NAMES`.
+        Names that override those of `NAMES`.
     wait_s
-        How long cells may take to load.
+        Time for cells to load, seconds.
     whole_map, whole_bytes
-        Publish the whole map; its size at most.
+        Whether to publish the whole map, and its largest size.
     voxels_every_s
-        How often voxels are published at most.
+        Shortest time between publications of voxels, seconds.
     """
 
     domain: int = 0
@@ -94,7 +94,7 @@ class BridgeSettings(msgspec.Struct, frozen=True):
     voxels_every_s: float = 1.0
 
     def name(self, what: str) -> str:
-        """Return the name of a service or topic, in full."""
+        """Return the full name of a service or topic."""
         return resolved(self.names.get(what, NAMES[what]), self.namespace)
 
 
@@ -104,22 +104,22 @@ class RosBridge:
     Parameters
     ----------
     client
-        Of the daemon; the bridge alone uses it.
+        Client of the daemon, used only by the bridge.
     settings
-        How it appears.
+        Settings in ROS.
     log
-        Takes a line about what goes wrong.
+        Called with a line about each problem.
     live
-        A live map of another client, to be served, too.
+        Live map to serve as well, on a different client.
 
     Raises
     ------
     BadRequest
-        A name is no ROS name, the domain is no domain, or the whole map is too large.
+        A name or the domain is invalid in ROS, or the whole map is too large.
     Busy
-        A bridge of this daemon runs in this domain.
+        Another bridge of this daemon runs in this domain.
     CannotStart
-        CycloneDDS does not start.
+        CycloneDDS cannot start.
     DaemonUnreachable
         The daemon does not answer.
     """
@@ -220,7 +220,7 @@ class RosBridge:
     def _add(self, name: str, kind: ServiceKind, listening: Listening) -> None:
         self._ids += 1
         number = self._id + self._ids.to_bytes(4, "big")
-        service_id = ".".join(f"{one:x}" for one in number)  # as rmw_cyclonedds_cpp writes it
+        service_id = ".".join(f"{one:x}" for one in number)  # in the notation of rmw_cyclonedds_cpp
         listening.add(ServiceServer(self._participant, name, kind, service_id))
 
     def _latched(self, name: str, kind: type) -> DataWriter:
@@ -279,7 +279,7 @@ class RosBridge:
                 look_s = time.monotonic() + _LOOK_S
 
     def _look(self) -> None:
-        """Look which clients there are."""
+        """Update the list of present clients."""
         clients = [(server, one) for server in self._servers for one in server.requesters()]
         self._map.alive = frozenset(one.name for _, one in clients)
         self._incompatible.look(clients)
@@ -298,12 +298,12 @@ class RosBridge:
 
 
 class _IncompatiblePeers:
-    """Clients with an unbounded wait, because their ROS is not that of CycloneDDS.
+    """Clients that wait without bound, because their ROS does not use CycloneDDS.
 
     Parameters
     ----------
     log
-        Takes a line about each, once.
+        Called once with a line about each client.
     """
 
     def __init__(self, log: Callable[[str], None]) -> None:
@@ -313,11 +313,11 @@ class _IncompatiblePeers:
 
     @property
     def now(self) -> list[dict[str, str]]:
-        """Incompatible clients now, at most 32: ``service``, and ``vendor`` of their DDS, maybe empty."""
+        """Present incompatible clients, at most 32: ``service``, and ``vendor`` of their DDS or empty."""
         return self._now
 
     def look(self, clients: Iterable[tuple[ServiceServer, Requester]]) -> None:
-        """Note which clients there are, and log each new incompatible one."""
+        """Record the present clients, and log each new incompatible one."""
         found = [(server, one) for server, one in clients if one.incompatible]
         for server, one in found:
             if one.name in self._logged:

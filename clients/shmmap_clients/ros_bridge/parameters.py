@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node's parameters: the services of ``rcl_interfaces`` as IDL, and rclcpp's answers; none can be set.
+"""The node's read-only parameters: services of ``rcl_interfaces`` as IDL, with answers as from rclcpp.
 
-Autoware's ``map_height_fitter`` waits until all parameter services of the map loader are there, and then asks
-``enable_partial_load`` whether to use the service or the topic.
+Autoware's ``map_height_fitter`` waits until all parameter services of the map loader are present.  Then it
+reads ``enable_partial_load`` to choose between the service and the topic.
 """
 
 from collections.abc import Mapping, Sequence
@@ -64,7 +64,7 @@ class Parameter(IdlStruct, typename="rcl_interfaces::msg::dds_::Parameter_"):
 @dataclass
 @sample
 class FloatingPointRange(IdlStruct, typename="rcl_interfaces::msg::dds_::FloatingPointRange_"):
-    """Which numbers are allowed."""
+    """Range of allowed numbers."""
 
     from_value: float64
     to_value: float64
@@ -74,7 +74,7 @@ class FloatingPointRange(IdlStruct, typename="rcl_interfaces::msg::dds_::Floatin
 @dataclass
 @sample
 class IntegerRange(IdlStruct, typename="rcl_interfaces::msg::dds_::IntegerRange_"):
-    """Which whole numbers are allowed."""
+    """Range of allowed whole numbers."""
 
     from_value: int64
     to_value: int64
@@ -84,7 +84,7 @@ class IntegerRange(IdlStruct, typename="rcl_interfaces::msg::dds_::IntegerRange_
 @dataclass
 @sample
 class ParameterDescriptor(IdlStruct, typename="rcl_interfaces::msg::dds_::ParameterDescriptor_"):
-    """What a parameter is."""
+    """Description of a parameter."""
 
     name: str
     type: uint8
@@ -99,7 +99,7 @@ class ParameterDescriptor(IdlStruct, typename="rcl_interfaces::msg::dds_::Parame
 @dataclass
 @sample
 class SetParametersResult(IdlStruct, typename="rcl_interfaces::msg::dds_::SetParametersResult_"):
-    """Whether a parameter is set, and why not."""
+    """Whether a parameter was set, and if not, the reason."""
 
     successful: bool
     reason: str
@@ -108,7 +108,7 @@ class SetParametersResult(IdlStruct, typename="rcl_interfaces::msg::dds_::SetPar
 @dataclass
 @sample
 class ListParametersResult(IdlStruct, typename="rcl_interfaces::msg::dds_::ListParametersResult_"):
-    """Names of parameters, and the prefixes that they have."""
+    """Names of parameters, and their prefixes."""
 
     names: sequence[str]
     prefixes: sequence[str]
@@ -127,7 +127,7 @@ class GetParametersRequest(IdlStruct, typename="rcl_interfaces::srv::dds_::GetPa
 @dataclass
 @sample
 class GetParametersResponse(IdlStruct, typename="rcl_interfaces::srv::dds_::GetParameters_Response_"):
-    """Those, in the order asked for."""
+    """The values, in the order of the request."""
 
     client: uint64
     number: int64
@@ -147,7 +147,7 @@ class GetParameterTypesRequest(IdlStruct, typename="rcl_interfaces::srv::dds_::G
 @dataclass
 @sample
 class GetParameterTypesResponse(IdlStruct, typename="rcl_interfaces::srv::dds_::GetParameterTypes_Response_"):
-    """Those, in the order asked for."""
+    """The types, in the order of the request."""
 
     client: uint64
     number: int64
@@ -157,7 +157,7 @@ class GetParameterTypesResponse(IdlStruct, typename="rcl_interfaces::srv::dds_::
 @dataclass
 @sample
 class SetParametersRequest(IdlStruct, typename="rcl_interfaces::srv::dds_::SetParameters_Request_"):
-    """Set each of these."""
+    """A request to set parameters one by one."""
 
     client: uint64
     number: int64
@@ -167,7 +167,7 @@ class SetParametersRequest(IdlStruct, typename="rcl_interfaces::srv::dds_::SetPa
 @dataclass
 @sample
 class SetParametersResponse(IdlStruct, typename="rcl_interfaces::srv::dds_::SetParameters_Response_"):
-    """What became of each."""
+    """The result for each parameter."""
 
     client: uint64
     number: int64
@@ -179,7 +179,7 @@ class SetParametersResponse(IdlStruct, typename="rcl_interfaces::srv::dds_::SetP
 class SetParametersAtomicallyRequest(
     IdlStruct, typename="rcl_interfaces::srv::dds_::SetParametersAtomically_Request_"
 ):
-    """Set all of these or none."""
+    """A request to set all of these parameters or none."""
 
     client: uint64
     number: int64
@@ -191,7 +191,7 @@ class SetParametersAtomicallyRequest(
 class SetParametersAtomicallyResponse(
     IdlStruct, typename="rcl_interfaces::srv::dds_::SetParametersAtomically_Response_"
 ):
-    """Whether they are set."""
+    """The result for all parameters together."""
 
     client: uint64
     number: int64
@@ -234,7 +234,7 @@ class DescribeParametersRequest(IdlStruct, typename="rcl_interfaces::srv::dds_::
 class DescribeParametersResponse(
     IdlStruct, typename="rcl_interfaces::srv::dds_::DescribeParameters_Response_"
 ):
-    """Those, in the order asked for."""
+    """The descriptions, in the order of the request."""
 
     client: uint64
     number: int64
@@ -263,18 +263,18 @@ PARAMETER_SERVICES: Final = {
         "rcl_interfaces/srv/DescribeParameters", DescribeParametersRequest, DescribeParametersResponse
     ),
 }
-"""Types by the last part of the service's name."""
+"""Types of the parameter services, by the last part of their names."""
 
 
 class Parameters:
-    """Values by name, and the fields of replies to the six parameter services.
+    """The parameters, and the replies of the six parameter services.
 
     Parameters
     ----------
     values
-        Parameters with their values.
+        Values of the parameters, by name.
     descriptions
-        Texts for some of them.
+        Descriptions of some parameters, by name.
     """
 
     def __init__(self, values: Mapping[str, Value], descriptions: Mapping[str, str] | None = None) -> None:
@@ -282,7 +282,7 @@ class Parameters:
         self._descriptions = dict(descriptions or {})
 
     def reply(self, service: str, message: Any) -> dict[str, Any]:
-        """Return the fields of a reply, those of its head left out.
+        """Return the fields of a reply, except those of its head.
 
         Parameters
         ----------
@@ -307,7 +307,7 @@ class Parameters:
         return {"result": SetParametersResult(not names, reason)}
 
     def _known(self, names: Sequence[str]) -> Sequence[str]:
-        """Return the names, or none where one is unknown: then rclcpp gives an empty answer."""
+        """Return the names, or none if one is unknown, for which rclcpp returns an empty answer."""
         return names if all(name in self._values for name in names) else ()
 
     def _value(self, name: str) -> ParameterValue:
@@ -341,7 +341,7 @@ class Parameters:
         return (_READ_ONLY if name in self._values else _NOT_DECLARED).format(name)
 
     def _listed(self, prefixes: Sequence[str], depth: int) -> ListParametersResult:
-        """Names below prefixes, at most ``depth`` parts down (0: all), as rclcpp lists them."""
+        """Return the names below prefixes, at most ``depth`` parts down (0: all), as rclcpp lists them."""
 
         def near(rest: str) -> bool:
             return depth == 0 or rest.count(".") < depth

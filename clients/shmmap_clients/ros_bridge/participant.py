@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The bridge's part in a DDS domain: names, settings of CycloneDDS, qualities of service, closing.
+"""The bridge's participant in a DDS domain: names, settings of CycloneDDS, quality of service, closing.
 
-ROS's names become those of DDS by ``rmw``'s mangling.  Settings of the user (``CYCLONEDDS_URI``,
-``ROS_LOCALHOST_ONLY``) count as they do for ROS nodes.
+ROS names become DDS names by the mangling of ``rmw``.  The user's settings (``CYCLONEDDS_URI``,
+``ROS_LOCALHOST_ONLY``) have the same effect as for ROS nodes.
 
-All clients of a service read the same topic. A writer keeps its last samples, ten of replies, and so never
-waits for a reader that has stopped: that one misses what has been replaced, and the others notice nothing.
+All clients of a service read the same topic. A writer keeps its last samples (ten replies), and so never
+waits for a reader that has stopped: this reader misses replaced samples, others are not affected.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ __all__ = [
 ]
 
 _NAME: Final = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
-_MOST: Final = 200  # DDS allows 255, with a prefix, a suffix and the parameter services' own part
+_MOST: Final = 200  # DDS allows 255, including a prefix, a suffix and the parameter services' part
 MAX_DOMAIN: Final = 232
-"""Highest number of a domain: those above have no UDP ports."""
+"""Highest domain number with valid UDP ports."""
 _LOCALHOST: Final = (
     "<CycloneDDS><Domain Id='any'><General><Interfaces><NetworkInterface address='127.0.0.1'/></Interfaces>"
     "</General></Domain></CycloneDDS>"
@@ -48,12 +48,12 @@ _BLOCKING_MS: Final = 100
 
 
 def resolved(name: str, namespace: str) -> str:
-    """Return a name in full: one that does not begin with a slash stands in the namespace.
+    """Return the full name; a name without a leading slash is in the namespace.
 
     Raises
     ------
     BadRequest
-        It is no name of a topic or service.
+        The name is invalid for a topic or service.
     """
     full = name if name.startswith("/") else f"{namespace.rstrip('/')}/{name}"
     if not _NAME.fullmatch(name) or not (namespace == "/" or _NAME.fullmatch(namespace)):
@@ -70,12 +70,12 @@ def resolved(name: str, namespace: str) -> str:
 
 
 def node_name(name: str) -> str:
-    """Return the name of a node, if it is one.
+    """Return the name of a node if it is valid.
 
     Raises
     ------
     BadRequest
-        It has a slash, or is no name.
+        The name has a slash or is otherwise invalid.
     """
     if "/" in name or not _NAME.fullmatch(name):
         raise BadRequest(f"{name!r} is no name of a node", hint="use letters, digits and _")
@@ -83,29 +83,29 @@ def node_name(name: str) -> str:
 
 
 def topic(name: str) -> str:
-    """Return what DDS calls a topic."""
+    """Return the DDS name of a topic."""
     return f"rt{name}"
 
 
 def request_topic(name: str) -> str:
-    """Return what DDS calls a service's requests."""
+    """Return the DDS name of a service's requests."""
     return f"rq{name}Request"
 
 
 def reply_topic(name: str) -> str:
-    """Return what DDS calls a service's replies."""
+    """Return the DDS name of a service's replies."""
     return f"rr{name}Reply"
 
 
 def settings(environ: Mapping[str, str] = os.environ) -> str:
-    """Return what CycloneDDS is configured with: what ROS says first, so that the user's counts over it."""
+    """Return the configuration of CycloneDDS: settings from ROS first, so that the user's override them."""
     localhost = [_LOCALHOST] if environ.get("ROS_LOCALHOST_ONLY") == "1" else []
     users = environ.get("CYCLONEDDS_URI", "")
     return ",".join([*localhost, *([users] if users else [])])
 
 
 def open_participant(domain: int) -> tuple[Domain, DomainParticipant]:
-    """Join a domain; `close` both.
+    """Join a domain; `close` both returned objects at the end.
 
     Raises
     ------
@@ -132,16 +132,16 @@ def open_participant(domain: int) -> tuple[Domain, DomainParticipant]:
 
 
 def endpoint_qos(user_data: str = "", *, depth: int = 10, latched: bool = False) -> Qos:
-    """Return the qualities of a reader or writer, as rclcpp's defaults are for services.
+    """Return the QoS of a reader or writer, with rclcpp's defaults for services.
 
     Parameters
     ----------
     user_data
-        Visible to the other participants.
+        Data that other participants can read.
     depth
-        How many samples are kept.
+        Number of samples kept.
     latched
-        A late reader gets the last samples, too (``transient_local``).
+        Whether a late reader also gets the last samples (``transient_local``).
     """
     policies: list[Any] = [
         Policy.Reliability.Reliable(duration(milliseconds=_BLOCKING_MS)),
@@ -157,6 +157,6 @@ def endpoint_qos(user_data: str = "", *, depth: int = 10, latched: bool = False)
 
 
 def close(*entities: Any) -> None:
-    """Close entities and all that they have made, now and not when Python collects them."""
+    """Close entities and their children now, instead of when Python collects them."""
     for one in entities:
         one.__del__()

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cells of the map as ``sensor_msgs/PointCloud2``, byte for byte as Autoware's map loader sends them.
 
-It reads a file by ``pcl::io::loadPCDFile`` and sends what is in it: each field with its own type, one after
-another without gaps, in the file's order. A map of x y z intensity has points of 16 bytes, one of x y z has
+Autoware's map loader reads a file by ``pcl::io::loadPCDFile`` and sends all its fields: each with its own
+type, without gaps, in the file's order. A map of x y z intensity has points of 16 bytes, one of x y z has
 points of 12. A cell's columns are the same fields. Autoware's nodes look x, y and z up by name and take only
-float32, so doubles, and coordinates with an origin of their own, are rounded to float32 here.
+float32, so doubles, and coordinates relative to an origin, are rounded to float32 here.
 
-Different from Autoware: points that are not finite are not in a cell; ``height`` is always 1; integers of 64
-bits, for which the message has no type, are left out.
+Differences from Autoware: a cell has no points that are not finite; ``height`` is always 1; 64-bit integers,
+for which the message has no type, are left out.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from shmmap_clients.ros_bridge.cdr import CdrWriter
 __all__ = ["CloudLayout", "cloud_layout", "fill_rows", "write_cloud", "write_cloud_head"]
 
 _DATATYPES: Final = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
-"""By numpy's names; numbers as in ``sensor_msgs/PointField``."""
+"""Numbers of ``sensor_msgs/PointField``, by numpy's type names."""
 _FLOAT32: Final = 7
 
 
 @dataclass(frozen=True, slots=True)
 class CloudLayout:
-    """How a point's bytes are divided.
+    """Layout of a point's bytes.
 
     Attributes
     ----------
@@ -41,9 +41,9 @@ class CloudLayout:
     columns
         Name, offset, type and count of each of the cell's columns, of which ``xyz`` is three fields.
     point_step
-        Bytes of a point.
+        Size of a point, bytes.
     described
-        The fields as bytes of the message, for a place at a multiple of four.
+        The fields as bytes of the message, to be aligned to four.
     """
 
     fields: tuple[tuple[str, int, int, int], ...]
@@ -88,18 +88,18 @@ def write_cloud(
     frame_id: str = "",
     stamp_ns: int = 0,
 ) -> None:
-    """Append a ``PointCloud2``; inside a cell Autoware's have an empty header.
+    """Append a ``PointCloud2``; inside a cell, its header is empty, as in Autoware.
 
     Parameters
     ----------
     columns
-        As those of the layout, of equal lengths; they are read when the message is put together.
+        Columns of the layout, of equal lengths; they are read when the message is assembled.
     origin
-        What ``xyz`` is relative to, metres.
+        Origin of ``xyz``, metres.
     layout
-        How a point's bytes are divided.
+        Layout of a point's bytes.
     frame_id, stamp_ns
-        For the header; nanoseconds since 1970.
+        Frame and time of the header, nanoseconds since 1970.
     """
     points = len(columns["xyz"])
     nbytes = points * layout.point_step
@@ -113,7 +113,7 @@ def write_cloud(
 def write_cloud_head(
     writer: CdrWriter, layout: CloudLayout, points: int, frame_id: str = "", stamp_ns: int = 0
 ) -> None:
-    """Append what stands in front of the points: header, size, fields."""
+    """Append the part before the points: header, size, fields."""
     writer.int32(stamp_ns // 10**9)
     writer.uint32(stamp_ns % 10**9)
     writer.text(frame_id)
@@ -128,10 +128,10 @@ def fill_rows(
     origin: tuple[float, float, float],
     layout: CloudLayout,
 ) -> None:
-    """Write points into ``place``: each value is copied once, from shared memory to where it is sent from.
+    """Write points into ``place``; each value is copied once, from shared memory to the sample.
 
-    They go value by value, five times as fast as point by point.  A column that is missing, or has other
-    values for a point than the layout's, leaves zeros.
+    Copying field by field is five times as fast as point by point.  A column that is missing, or differs from
+    the layout, leaves zeros.
     """
     step = layout.point_step
     count = len(place) // step

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One ROS service over CycloneDDS, as rmw_cyclonedds_cpp speaks it.
+"""One ROS service over CycloneDDS, in the protocol of rmw_cyclonedds_cpp.
 
-A service is two topics: requests are read, replies are written, and every client reads all replies and takes
-its own. Reader and writer say in their user data that they belong together (``serviceid=``), and so do a
-client's (``clientid=``). A reply is written only when the client's reader is known: one that is not known yet
-would miss it. Up to 100 ms are waited for that, as ``rmw_send_response`` does; the first time that a client
-asks until a second after it was found, for on a busy machine its two ends may be found apart.
+A service has two topics, for requests and for replies; every client reads all replies and takes its own. The
+server's reader and writer share an id in their user data (``serviceid=``), and so do those of a client
+(``clientid=``). A reply is written only when the client's reader is known, because a reader discovered later
+would miss it. The server waits up to 100 ms for it, as ``rmw_send_response`` does. At a client's first
+request it waits until a second after discovery: a busy machine may discover reader and writer apart.
 
-Other implementations of ROS send no ``clientid=``. They carry the number of a request outside of the message,
-where neither can read the other's, and their clients wait without bound: they are incompatible peers.
+Other implementations of ROS send no ``clientid=``. They transport the number of a request outside of the
+message, where CycloneDDS cannot read it, and their clients wait without bound: they are incompatible peers.
 """
 
 from __future__ import annotations
@@ -46,28 +46,28 @@ _KNOWN_AT_FIRST_S: Final = 1.0
 _KNOWN_WITHIN_S: Final = 0.1
 _LOOK_EVERY_S: Final = 0.01
 _KEPT: Final = 1024
-"""Requests that a reader keeps until they are taken: of all clients together, so more than rclcpp's ten."""
+"""Requests that a reader queues, of all clients together, and so more than rclcpp's ten."""
 _CLIENT_ID: Final = re.compile(rb"(?:^|;)clientid=([^;]*);")
 _PARTICIPANT_HEX: Final = 24
-"""Digits of an endpoint's key, in hexadecimal, that are its participant's."""
+"""Number of hexadecimal digits of an endpoint's key that identify its participant."""
 _VENDORS: Final = {0x0101: "RTI Connext", 0x010F: "Fast DDS", 0x0110: "CycloneDDS", 0x0112: "RustDDS"}
-"""By the first two bytes of an endpoint's key: there most implementations put their number (DDSI-RTPS)."""
+"""Vendors by the first two bytes of an endpoint's key, where most implementations put an id (DDSI-RTPS)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Requester:
-    """The client behind a request: its writer of requests.
+    """The client of a request, identified by its writer of requests.
 
     Attributes
     ----------
     name
-        Its ``clientid``, or the key of the writer where it has none.
+        The ``clientid``, or the writer's key if there is none.
     incompatible
-        It has none.
+        Whether the client has no ``clientid``.
     vendor
-        Of its DDS; empty where that is unknown.
+        Vendor of the client's DDS; empty if unknown.
     found_s
-        When it was found, on the clock of `time.monotonic`.
+        Time of discovery, on `time.monotonic`.
     """
 
     name: str
@@ -83,13 +83,13 @@ class Tries:
     Attributes
     ----------
     begun_s
-        When the first time that the daemon was there, on the clock of `time.monotonic`; 0: not yet.
+        Time of the first attempt with a reachable daemon, on `time.monotonic`; 0: none yet.
     was_requeued
-        It has been put back: its client may have gone.
+        Whether the request was put back, so that its client may have left since.
     failed
-        How often it failed although the daemon answered something else in between.
+        Number of failures between which the daemon answered other requests.
     answers
-        How much the daemon had answered at the last failure.
+        Number of the daemon's answers at the last failure.
     """
 
     begun_s: float = 0.0
@@ -100,16 +100,16 @@ class Tries:
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """A request that has come.
+    """A received request.
 
     Attributes
     ----------
     server
-        Of the service.
+        Server of the service.
     message
-        Its ``client`` and ``number`` go into the reply.
+        The message; its ``client`` and ``number`` are copied to the reply.
     requester, handle
-        The client; DDS's number of its writer.
+        The client, and the DDS handle of its writer.
     tries
         Attempts so far.
     """
@@ -122,18 +122,18 @@ class Request:
 
 
 class ServiceServer:
-    """Takes requests of one service and writes replies.
+    """Server of one service: takes requests and writes replies.
 
     Parameters
     ----------
     participant
-        Of the domain.
+        Participant in the domain.
     name
-        The service's, in full.
+        Full name of the service.
     kind
-        Its messages.
+        Types of the service.
     service_id
-        Which server it is: no other of the domain has this one.
+        Id of the server, unique in the domain.
     """
 
     def __init__(self, participant: DomainParticipant, name: str, kind: ServiceKind, service_id: str) -> None:
@@ -146,15 +146,15 @@ class ServiceServer:
         self._writer = DataWriter(participant, replies, endpoint_qos(belongs))
         self.condition = ReadCondition(self._reader, ViewState.Any | SampleState.NotRead | InstanceState.Any)
         self._lock = threading.Lock()  # one thread takes requests, another one replies
-        self._requesters: dict[int, Requester] = {}  # by DDS's number of the writer of requests
-        # clientid, or participant where there is none, by DDS's number of the reader of replies
+        self._requesters: dict[int, Requester] = {}  # by DDS handle of the writer of requests
+        # clientid, or else participant, by DDS handle of the reader of replies
         self._readers: dict[int, str] = {}
 
     def __repr__(self) -> str:
         return f"<ServiceServer {self.name}>"
 
     def take(self) -> Iterator[Request | Damaged]:
-        """Take the requests that have come; of one that is no message of the service, why not."""
+        """Take the received requests; for an invalid message, the reason instead of a request."""
         for one in self._reader.take(_KEPT):
             if not one.sample_info.valid_data:
                 continue
@@ -167,7 +167,7 @@ class ServiceServer:
                 yield Request(self, one, requester, handle)
 
     def requesters(self) -> list[Requester]:
-        """All clients that there are now, whether they have asked or not."""
+        """All present clients, including those without requests."""
         handles = _unsigned(self._reader.get_matched_publications())
         readers = _unsigned(self._writer.get_matched_subscriptions())
         with self._lock:
@@ -178,10 +178,10 @@ class ServiceServer:
         return [found for one in handles if (found := self._requester(one)) is not None]
 
     def present(self, request: Request) -> bool:
-        """Whether the client can receive the reply; waits a moment for its reader to be found.
+        """Return whether the client can receive the reply, after a short wait for discovery of its reader.
 
-        A client without ``clientid=`` counts as present after its first second: its reader may belong to
-        another participant.
+        A client without ``clientid=`` counts as reachable after its first second, because its reader may
+        belong to another participant.
         """
         requester = request.requester
         owner = requester.name[:_PARTICIPANT_HEX] if requester.incompatible else requester.name
@@ -200,15 +200,15 @@ class ServiceServer:
         return True
 
     def gone(self, request: Request) -> bool:
-        """Whether the requesting client is gone."""
+        """Return whether the requesting client has left."""
         return self._requester(request.handle, refresh=True) is None
 
     def reply(self, content: Content) -> str:
-        """Send a reply; returns why it cannot be sent, empty when it was."""
+        """Send a reply; return an empty text, or the reason why it cannot be sent."""
         return self._write(ready_made(self.kind.reply, content))
 
     def reply_fields(self, request: Request, **fields: Any) -> str:
-        """Send a reply of these fields; returns why it cannot be sent, empty when it was."""
+        """Send a reply of these fields; return an empty text, or the reason why it cannot be sent."""
         message = request.message
         return self._write(self.kind.reply(client=message.client, number=message.number, **fields))
 
@@ -220,7 +220,7 @@ class ServiceServer:
         return ""
 
     def _requester(self, handle: int, *, refresh: bool = False) -> Requester | None:
-        """Return the client behind a writer; None when it is gone.  ``refresh``: look it up again."""
+        """Return the client of a writer; None if it has left.  ``refresh``: look it up again."""
         with self._lock:
             known = self._requesters.get(handle)
             if known is not None and (
@@ -238,7 +238,7 @@ class ServiceServer:
             return one
 
     def _has_reader(self, owner: str) -> bool:
-        """Look for a client's reader among those that are known now."""
+        """Look for a client's reader among the known readers."""
         handles = _unsigned(self._writer.get_matched_subscriptions())
         with self._lock:
             for handle in handles - self._readers.keys():
@@ -255,19 +255,19 @@ def _client_id(endpoint: Any) -> str:
 
 
 def _unsigned(handles: Iterable[int]) -> set[int]:
-    """Numbers of DDS as they are: some of the package's calls take them for signed ones."""
+    """Return DDS handles as unsigned numbers; some calls of the package return them as signed."""
     return {one & (2**64 - 1) for one in handles}
 
 
 class Listening:
-    """Some services of a participant, whose requests one thread takes: it sleeps until one has come.
+    """Waits for requests of several services of a participant, on behalf of one thread.
 
     Parameters
     ----------
     participant
-        Of the domain.
+        Participant in the domain.
     log
-        Takes a line about what came and was no request.
+        Called with a line about each invalid message.
 
     Attributes
     ----------
@@ -283,20 +283,20 @@ class Listening:
         self._waitset.attach(self._wake)
 
     def add(self, server: ServiceServer) -> None:
-        """Listen to one service more."""
+        """Add a service."""
         self.servers.append(server)
         self._waitset.attach(server.condition)
 
     def wait(self, timeout_s: float) -> None:
-        """Sleep until a request has come, `wake` is called or the timeout is over."""
+        """Sleep until a request arrives, `wake` is called or the timeout expires."""
         self._waitset.wait(duration(nanoseconds=max(int(timeout_s * 1e9), 0)))
 
     def wake(self) -> None:
-        """End `wait`, and every later one at once."""
+        """End `wait`, and make all later calls return at once."""
         self._wake.set(True)
 
     def take(self) -> Iterator[Request]:
-        """Take all requests that have come."""
+        """Take all received requests."""
         for server in self.servers:
             for one in server.take():
                 if isinstance(one, Damaged):

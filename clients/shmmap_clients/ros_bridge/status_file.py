@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The bridge's status for ``shmmap doctor``: a small file beside the daemon's socket.
 
-Its name is ``INSTANCE.ros-bridge-DOMAIN.json``. While a bridge runs it holds a lock on it (fcntl(2)):
-the file of one that was killed counts for nothing, and no second bridge answers the same requests. It is
-written in place by one call, with blanks to its former length, so that no reader sees half of it.
+Its name is ``INSTANCE.ros-bridge-DOMAIN.json``. A running bridge holds a lock on the file (fcntl(2)): the
+file of a killed bridge is ignored, and no second bridge answers the same requests. The file is rewritten in
+place by one call, padded with blanks to its former length, so that no reader sees a partial status.
 
-Where the daemon's directory may not be written, it lies in the user's own, ``$XDG_RUNTIME_DIR/shmmap``; if
-that cannot be written either, there is no file.
+If the daemon's directory is not writable, the file is in the user's own, ``$XDG_RUNTIME_DIR/shmmap``; if
+that is not writable either, there is no file.
 """
 
 from __future__ import annotations
@@ -32,24 +32,24 @@ def status_name(instance: str, domain: int) -> str:
 
 
 class StatusFile:
-    """The file, from the bridge's start to its end.
+    """The status file, which exists while the bridge runs.
 
     Parameters
     ----------
     endpoint
         The daemon's socket.
     instance, domain
-        Whose cells the bridge serves, and where.
+        Instance of the daemon, and DDS domain of the bridge.
 
     Attributes
     ----------
     path
-        Where it is; empty where it could not be made.
+        Path of the file; empty if it could not be created.
 
     Raises
     ------
     Busy
-        A bridge of this daemon runs in this domain.
+        Another bridge of this daemon runs in this domain.
     """
 
     def __init__(self, endpoint: str, instance: str, domain: int) -> None:
@@ -67,18 +67,18 @@ class StatusFile:
             try:
                 fd = os.open(path, flags, _MODE)
             except OSError:
-                return False  # not for this user, or there is no such directory
+                return False  # not writable for this user, or no such directory
             try:
                 fcntl.lockf(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 status = os.fstat(fd)
                 same = os.path.samestat(status, os.stat(path, follow_symlinks=False))
-            except (BlockingIOError, PermissionError):  # as POSIX lets a system choose
+            except (BlockingIOError, PermissionError):  # POSIX allows either error
                 os.close(fd)
                 raise Busy(
                     f"another bridge of this daemon runs in this domain: it holds {path}",
                     hint="stop it, or choose another --domain",
                 ) from None
-            except FileNotFoundError:  # the one before was just ending
+            except FileNotFoundError:  # the previous bridge is just ending
                 same = False
             if same and stat.S_ISREG(status.st_mode):
                 self.path, self._fd, self._written = path, fd, status.st_size
@@ -93,7 +93,7 @@ class StatusFile:
             return
         data = json.dumps(status).encode() + b"\n"
         data = data.ljust(self._written)
-        with contextlib.suppress(OSError):  # a full disk: the older status stays
+        with contextlib.suppress(OSError):  # on a full disk the last status stays
             self._written = max(self._written, os.pwrite(self._fd, data, 0))
 
     def close(self) -> None:

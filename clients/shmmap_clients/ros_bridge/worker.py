@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Workers that answer requests which need the daemon: each in a thread of its own, and clients take turns.
+"""Workers that answer requests with data of the daemon, each in its own thread, with turns of clients.
 
-A ROS client waits without bound. So while the daemon is away a request is kept, and answered when it is back,
-unless the client has gone meanwhile. One that takes long, or fails while others succeed, waits behind those
-of other clients, and is given up after some tries. What the daemon refuses is answered with nothing, and
-logged; what is too large is not answered at all, because an answer without cells would be taken for one.
+A ROS client waits without bound. So requests are kept while the daemon is away, and answered when it is back,
+unless the client has left. A request that takes long, or fails while others succeed, is put behind those of
+other clients, and dropped after some attempts. A request that the daemon refuses is logged and gets an empty
+answer. One whose answer is too large gets none, because the client would take an empty answer for a result.
 """
 
 from __future__ import annotations
@@ -32,29 +32,29 @@ __all__ = [
 ]
 
 MAX_PER_CLIENT: Final = 4
-"""Of one client: rclcpp nodes have one under way."""
+"""Largest number of waiting requests of one client; rclcpp nodes send one at a time."""
 MAX_WAITING: Final = 1024
 LATER: Final = (DaemonUnreachable, NoSession, Busy, LiveInterrupted, StaleHandle)
-"""Errors that pass by themselves."""
+"""Temporary errors, after which a request is tried again."""
 _AGAIN_S: Final = 0.2
 _MAX_FAILED: Final = 5
-"""Tries of one request that fail while the daemon answers others."""
+"""Failed attempts at one request, while the daemon answers others, before it is dropped."""
 Answer = tuple[Content, Callable[[], None]]
 
 
 class WaitingRequests:
-    """A queue, for one thread.  Each round has one request of each client that waits."""
+    """Fair queue for one thread; each round has one request of each waiting client."""
 
     def __init__(self) -> None:
-        self._queue: OrderedDict[int, tuple[int, Request]] = OrderedDict()  # by number, with the round
-        self._of: dict[str, list[int]] = {}  # numbers by client, the oldest first
+        self._queue: OrderedDict[int, tuple[int, Request]] = OrderedDict()  # with the round, by number
+        self._of: dict[str, list[int]] = {}  # numbers by client, oldest first
         self._next = self._round = 0
 
     def __len__(self) -> int:
         return len(self._queue)
 
     def put(self, request: Request) -> bool:
-        """Append a request; False if there are too many.  Of one client's the oldest then makes room."""
+        """Append a request; return False if the queue is full.  Drop a client's oldest above its limit."""
         mine = self._of.get(request.requester.name, ())
         if len(mine) >= MAX_PER_CLIENT:
             self._forget(mine[0])
@@ -65,11 +65,11 @@ class WaitingRequests:
         return True
 
     def requeue(self, request: Request) -> None:
-        """Put back what could not be answered yet: every other client comes first."""
+        """Put back a request that could not be answered yet, behind every other client."""
         self._append(self._round + 1, request)
 
     def get(self) -> Request:
-        """Take the request whose turn it is; there has to be one."""
+        """Take the next request; the queue must not be empty."""
         number = min(self._queue, key=lambda one: (self._queue[one][0], one))
         self._round = self._queue[number][0]
         return self._forget(number)
@@ -89,30 +89,30 @@ class WaitingRequests:
 
 
 def no_followup() -> None:
-    """Do nothing after an answer was sent."""
+    """Do nothing after an answer has been sent."""
 
 
 class StillLoading(Exception):
-    """Cells are still being loaded: others' requests come first."""
+    """Cells are still being loaded: other clients' requests come first."""
 
 
 class TooLarge(BadRequest):
-    """No answer can hold what was asked for."""
+    """The requested data do not fit into one answer."""
 
 
 class Worker(ABC):
-    """Answers requests and does what comes up regularly.
+    """Thread that answers requests and runs a periodic task.
 
     Parameters
     ----------
     listening
-        Where requests come, for this worker only.
+        Source of requests, for this worker only.
     stop
         Set when the program ends.
     every_s
-        How often `tick` is called.
+        Interval of calls of `tick`, seconds.
     log
-        Takes a line about what goes wrong, and when it is right again.
+        Called with a line about each problem and its end.
     """
 
     def __init__(
@@ -132,11 +132,11 @@ class Worker(ABC):
 
     @abstractmethod
     def empty(self, message: Any) -> Content:
-        """Return the reply that has nothing."""
+        """Return the empty reply."""
 
     @abstractmethod
     def tick(self) -> None:
-        """Do what comes up regularly."""
+        """Run the periodic task."""
 
     def run(self) -> None:
         """Work until the program ends."""
@@ -171,7 +171,7 @@ class Worker(ABC):
             if self._has_failed(tries):
                 self._log(f"{server.name}: not answered after {tries.failed} tries: {error}")
                 return
-            tries.begun_s = 0.0  # cells have all their time when the daemon is back
+            tries.begun_s = 0.0  # restart the timeout of cells when the daemon is back
             self._try_again(request)
             self._stop.wait(_AGAIN_S)
             return
@@ -193,7 +193,7 @@ class Worker(ABC):
         self._waiting.requeue(request)
 
     def _has_failed(self, tries: Tries) -> bool:
-        """Whether it is this request that fails, and not the daemon that is away."""
+        """Return whether the request fails by itself, not because the daemon is away."""
         if self._answered > tries.answers:
             tries.answers = self._answered
             tries.failed += 1

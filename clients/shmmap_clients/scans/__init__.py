@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scans of a LiDAR and the poses that belong to them, from files or from a socket."""
+"""LiDAR scans and their poses, from files or from a socket."""

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rows of a ``.bin`` scan: bare numbers, with columns that a user names or that their values reveal.
+"""Layout of a ``.bin`` scan: rows of bare numbers, with columns named by the user or guessed from values.
 
 KITTI writes four float32 a point (x y z intensity), nuScenes five (and ring), others three or six, or
-doubles; nothing in the file says which.  A layout is taken only where coordinates and intensity look like
-such, and where rows of that length explain the numbers best: how numbers are spread differs from column to
-column, so the right length is the one whose columns take the fewest bits to write.
+doubles; the file does not contain its layout.  A layout is accepted only if coordinates and intensity are
+plausible, and if rows of its length explain the numbers best: the distribution of numbers differs between
+columns, so the right length is the one whose columns can be coded with the fewest bits.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ OPTION_HINT: Final = (
 
 _TYPE: Final = re.compile(r"[<>]?(f4|f8|[iu][1248])")
 _LENGTHS: Final = (4, 3, 5, 6)
-"""Numbers a row that are recognised; where nothing else decides, the earlier."""
-_LONGER: Final = (7, 8)  # refused where they explain the numbers better
+"""Recognised numbers of values a row; the earlier one wins a tie."""
+_LONGER: Final = (7, 8)  # refused if they explain the numbers better
 _NAMES: Final = ("x", "y", "z", "intensity")
 _FARTHEST_M: Final = 1e7  # the largest northing; scans may be in a map's frame
-_NEAREST_M: Final = 1e-6  # smaller numbers, zero apart, are halves of others
+_NEAREST_M: Final = 1e-6  # smaller numbers, except zero, are halves of doubles
 _LARGEST_INTENSITY: Final = 65535.0
-_BAD_SHARE: Final = 0.02  # of numbers that may look wrong: some scanners mark lost returns
+_BAD_SHARE: Final = 0.02  # allowed share of implausible numbers: some scanners mark lost returns
 _SAMPLE_BYTES: Final = 1 << 20
-_FEW: Final = 840  # numbers: a multiple of all lengths; fewer say nothing of the length
+_FEW: Final = 840  # numbers, a multiple of all lengths; fewer do not determine the length
 _BITS_FOR_MULTIPLE: Final = 0.5
-"""Bits a number that a multiple of a length must save: scanners that fire lasers in turn save some, too."""
+"""Bits a number that a multiple of a length must save; scanners that fire lasers in turn also save some."""
 _BITS_FOR_OTHER: Final = 0.1
 
 
@@ -49,21 +49,21 @@ class BinLayout:
     Attributes
     ----------
     columns
-        Name and numpy's type of each, ``("x", "<f4")``; a name ``_`` is left out.
+        Name and numpy type of each, such as ``("x", "<f4")``; columns named ``_`` are left out.
     """
 
     columns: tuple[tuple[str, str], ...]
 
     @classmethod
     def parse(cls, text: str) -> BinLayout:
-        """Read ``x,y,z,intensity``: names with commas between them, float32 where no type is said.
+        """Parse ``x,y,z,intensity``: names separated by commas, float32 by default.
 
-        ``x:f8,y,z,t:u4``: a type holds for the columns after it, too; ``_`` skips a column.
+        In ``x:f8,y,z,t:u4``, a type also applies to the columns after it; ``_`` skips a column.
 
         Raises
         ------
         BadRequest
-            A type is unknown, a name comes twice, or x, y or z is missing.
+            A type is unknown, a name is repeated, or x, y or z is missing.
         """
         kind, columns = "f4", []
         for word in text.split(","):
@@ -94,14 +94,14 @@ class BinLayout:
         return f"rows of {len(self.columns)} {kinds.pop() if len(kinds) == 1 else 'numbers'}, {names}"
 
     def read(self, name: str) -> dict[str, NDArray[Any]]:
-        """Read a file: ``xyz`` (N, 3) float32, or float64 where the file has that, and the other columns.
+        """Read a file: ``xyz`` (N, 3) float32, or float64 as in the file, and the other columns.
 
         Raises
         ------
         MapDataError
-            Its size is no number of rows, or x, y and z cannot be coordinates.
+            The size is not a multiple of a row, or x, y and z are implausible as coordinates.
         OSError
-            It cannot be read.
+            The file cannot be read.
         """
         size = os.path.getsize(name)
         if size % self.row_bytes:
@@ -126,14 +126,14 @@ class BinLayout:
 
 
 def guess_layout(name: str) -> BinLayout | None:
-    """Return the columns of a file by what its numbers look like; None: it is empty.
+    """Guess the columns of a file from its numbers; None for an empty file.
 
     Raises
     ------
     MapDataError
-        They look like no rows that are known.
+        The numbers fit no known layout.
     OSError
-        It cannot be read.
+        The file cannot be read.
     """
     size = os.path.getsize(name)
     if not size:
@@ -143,7 +143,7 @@ def guess_layout(name: str) -> BinLayout | None:
     reasons: list[str] = []
     if not size % 4:
         floats = np.frombuffer(sample[: len(sample) // 8 * 8 or 4], "<f4")
-        words = floats.view("<u4")  # lower halves of doubles of few digits are zero
+        words = floats.view("<u4")  # the lower halves of doubles with few digits are zero
         halves = len(words) > 1 and not words[::2].any() and bool(words[1::2].any())
         if not halves:
             found = _lengths(floats, size, 4, reasons)
@@ -161,7 +161,7 @@ def guess_layout(name: str) -> BinLayout | None:
 
 
 def _layout(values: NDArray[Any], length: int) -> BinLayout:
-    """Name the columns of rows of a length."""
+    """Return the names of columns for a number of values a row."""
     rows = values[: len(values) // length * length].reshape(-1, length)
     names = [*_NAMES][:length]
     for number in range(len(names), length):
@@ -173,7 +173,7 @@ def _layout(values: NDArray[Any], length: int) -> BinLayout:
 
 
 def _lengths(values: NDArray[Any], size: int, each: int, reasons: list[str]) -> list[int]:
-    """Return the lengths of rows with plausible columns; append to ``reasons`` why the others are not."""
+    """Return the lengths of rows with plausible columns; append to ``reasons`` why others are not."""
     found = []
     for length in _LENGTHS:
         if size % (length * each):
@@ -188,12 +188,12 @@ def _lengths(values: NDArray[Any], size: int, each: int, reasons: list[str]) -> 
 
 
 def _best(name: str, values: NDArray[Any], lengths: list[int]) -> int:
-    """Return the length, among those that look right, that explains the numbers best; 0: there is none.
+    """Return the plausible length that explains the numbers best; 0 if there is none.
 
     Raises
     ------
     MapDataError
-        One that is not among them explains them better.
+        An implausible length explains the numbers better.
     """
     if not lengths or len(values) < 2 * _FEW:
         return lengths[0] if lengths else 0
@@ -217,10 +217,10 @@ def _best(name: str, values: NDArray[Any], lengths: list[int]) -> int:
 
 
 def _bits(values: NDArray[Any], length: int) -> float:
-    """Return how many bits a number's sign and exponent take, where each column has a code of its own.
+    """Return the bits that a number's sign and exponent take, if each column has its own code.
 
-    That is the evidence of one categorical distribution a column with Jeffreys' prior (Krichevsky and
-    Trofimov 1981): a column more costs what it takes to learn its code.
+    This is the evidence of one categorical distribution a column with Jeffreys' prior (Krichevsky and
+    Trofimov 1981): each additional column costs the bits to learn its code.
     """
     used = values[: len(values) // _FEW * _FEW]
     shift, word = (23, "<u4") if used.dtype.itemsize == 4 else (52, "<u8")
@@ -235,7 +235,7 @@ def _bits(values: NDArray[Any], length: int) -> float:
 
 
 def _no_coordinates(xyz: NDArray[Any]) -> str:
-    """Say why numbers are no coordinates in metres; empty where they may be."""
+    """Return why numbers cannot be coordinates in metres, or an empty text if they can."""
     for axis, values in zip("xyz", xyz.T, strict=True):
         size = np.abs(values[np.isfinite(values)])
         good = (size == 0) | ((size >= _NEAREST_M) & (size <= _FARTHEST_M))
@@ -255,5 +255,5 @@ def _no_intensity(values: NDArray[Any]) -> str:
 
 
 def _too_many(bad: NDArray[np.bool_]) -> bool:
-    """Whether more numbers look wrong than some scanners' marks of lost returns."""
+    """Return whether more numbers are implausible than marks of lost returns explain."""
     return int(np.count_nonzero(bad)) > max(1, int(_BAD_SHARE * len(bad)))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One scan from one file: PCD, NPZ, bare rows (``.bin``), any cloud that shmmap reads; and a thinner one."""
+"""Reading one scan from a file: PCD, NPZ, bare rows (``.bin``), any cloud that shmmap reads; thinning."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ __all__ = ["MIN_RANGE_M", "SCAN_SUFFIXES", "ScanReader", "read_scan", "thinned"]
 
 SCAN_SUFFIXES: Final = (".pcd", ".npz", ".bin")
 MIN_RANGE_M: Final = 0.5
-"""Programs leave out nearer points: no-returns at (0, 0, 0), and the vehicle's own parts."""
+"""Default range below which points are left out: no-returns at (0, 0, 0) and parts of the vehicle."""
 _NO_ARCHIVE: Final = (
     ValueError,
     KeyError,
@@ -38,24 +38,24 @@ Columns = dict[str, NDArray[Any]]
 
 
 def _silent(note: str) -> None:
-    """Say nothing."""
+    """Do nothing."""
 
 
 @dataclass(slots=True)
 class ScanReader:
-    """Reads all scans of a program alike.
+    """Reader of all scans of a program, with the same settings.
 
     Attributes
     ----------
     bin_layout
-        Columns of ``.bin`` files; None: guessed from the first that is not empty, and said.
+        Columns of ``.bin`` files; None: guessed from the first non-empty file, and reported.
     min_range
-        `screened` leaves out nearer points, metres from the sensor; None: it leaves out nothing, also
-        not what is not finite.
+        Range in metres below which `screened` leaves out points; None: it keeps all points, even those not
+        finite.
     say
-        Called once with each note on how files are read.
+        Called once with each note about the format of files.
     too_near, not_finite
-        Points that `screened` has left out.
+        Number of points that `screened` has left out.
     """
 
     bin_layout: BinLayout | None = None
@@ -66,26 +66,27 @@ class ScanReader:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Points left out so far, by the names that they have in JSON."""
+        """Number of points left out so far, by their names in JSON."""
         return {"too_near": self.too_near, "not_finite": self.not_finite}
 
     @property
     def left_out(self) -> str:
-        """What was left out, in words; empty where nothing was."""
+        """Description of the points left out; empty if there are none."""
         near = f"{self.too_near} points nearer than {self.min_range:g} m" if self.too_near else ""
         return ", ".join(filter(None, [near, f"{self.not_finite} not finite" if self.not_finite else ""]))
 
     def read(self, path: str | os.PathLike[str]) -> Columns:
-        """Return all columns of a file by name, ``xyz`` (N, 3) among them, metres, and all its rows.
+        """Return all columns and rows of a file, by name, including ``xyz`` (N, 3), metres.
 
-        An NPZ holds ``xyz`` in metres or ``xyz_4mm`` in units of 4 mm, and any arrays of as many rows.
+        An NPZ holds ``xyz`` in metres or ``xyz_4mm`` in units of 4 mm, and any arrays with the same number of
+        rows.
 
         Raises
         ------
         MapMissing
             There is no such file.
         MapDataError
-            The file is not what its name says, or no file but a pipe or a directory.
+            The contents do not fit the suffix, or the path is a pipe or a directory.
         """
         name = os.fspath(path)
         suffix = os.path.splitext(name)[1].lower()
@@ -105,22 +106,22 @@ class ScanReader:
         return dict(read_cloud(name, keep_non_finite=True).columns)
 
     def points(self, path: str | os.PathLike[str]) -> NDArray[np.floating]:
-        """Return the points of a file that count, (N, 3); see `read` and `screened`."""
+        """Return the screened points of a file, (N, 3); see `read` and `screened`."""
         return self.screened(self.read(path))[0]["xyz"]
 
     def screened(self, columns: Columns) -> tuple[Columns, NDArray[np.int64] | None]:
-        """Leave out points that are not finite or nearer than `min_range`, and count them.
+        """Remove and count points that are not finite or nearer than `min_range`.
 
         Returns
         -------
-        The columns, and which rows they are; None: all.
+        The columns, and the numbers of their rows; None for all rows.
         """
         if self.min_range is None:
             return columns, None
         xyz = columns["xyz"]
         finite = np.asarray(np.isfinite(xyz).all(axis=1))
         with np.errstate(over="ignore", invalid="ignore"):
-            # NaN is no nearer than anything
+            # comparisons with NaN are false, so that NaN is not near
             near = np.einsum("ij,ij->i", xyz, xyz, dtype=np.float64, casting="unsafe") < self.min_range**2
         good = finite & ~near
         if good.all():
@@ -146,7 +147,7 @@ def read_scan(path: str | os.PathLike[str]) -> NDArray[np.floating]:
     MapMissing
         There is no such file.
     MapDataError
-        The file is not what its name says.
+        The contents do not fit the suffix.
     """
     return ScanReader(min_range=0.0).points(path)
 
@@ -170,19 +171,19 @@ def _from_npz(name: str) -> Columns:
 
 
 def thinned(points: NDArray[np.floating], edge: float | None) -> NDArray[np.floating]:
-    """Return the mean of the points in each cube of ``edge`` metres; the points themselves without an edge.
+    """Return the mean of the points in each cube of ``edge`` metres; without an edge, the points.
 
     Parameters
     ----------
     points : (N, 3)
-        Metres.
+        Points, metres.
     edge
-        Metres; None: all points.
+        Edge of the cubes, metres; None: all points.
 
     Raises
     ------
     BadRequest
-        The edge makes no sense.
+        The edge is invalid.
     """
     if edge is None or not len(points):
         return points

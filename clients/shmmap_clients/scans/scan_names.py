@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the names of scans say: their order, and which poses are theirs."""
+"""Names of scans: their order, and the matching poses."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ __all__ = ["in_order", "pair_with_poses", "stem"]
 
 _NUMBERS: Final = re.compile(r"([0-9]+)")
 _DECIMAL: Final = re.compile(r"(?<![0-9.A-Za-z])[0-9]*\.[0-9]+(?![0-9.])|(?<![0-9.])[0-9]+\.[0-9]+(?![0-9.])")
-_UNITS: Final = (1.0, 1e-3, 1e-6, 1e-9)  # of times: seconds to nanoseconds
-_CLOCK: Final = 1e8  # whole numbers from here on are times, not places
+_UNITS: Final = (1.0, 1e-3, 1e-6, 1e-9)  # units of times: seconds to nanoseconds
+_CLOCK: Final = 1e8  # whole numbers from here on are times, not counts
 _CLOSEST_S: Final = 0.05
 _RENAME: Final = "give numbers the same width: 0.05 0.10 0.15, or 0001 0002 0010"
 
 
 def stem(path: Path) -> str:
-    """Return a scan's name without its suffix; ``.pcd.bin`` is one."""
+    """Return a scan's name without its suffix; ``.pcd.bin`` is one suffix."""
     return path.stem.removesuffix(".pcd") if path.suffix.lower() == ".bin" else path.stem
 
 
 def in_order(files: Sequence[Path]) -> list[Path]:
     """Return files sorted by the numbers in their names, ``s_9`` before ``s_10``.
 
-    A number with a point in it is a decimal one, ``0.05`` before ``0.1``, unless the digits behind the point
-    count up: ``1.9``, ``1.10``.
+    A number with a point is decimal, ``0.05`` before ``0.1``, unless the digits after the point are a
+    counter: ``1.9``, ``1.10``.
 
     Raises
     ------
     BadRequest
-        They could be both, and the order would not be the same; or two files are one scan.
+        Numbers may be decimal or counters, with different orders; or two files are the same scan.
     """
     by_stem: dict[str, Path] = {}
     for path in sorted(files):
@@ -56,7 +56,7 @@ def in_order(files: Sequence[Path]) -> list[Path]:
     digits = [fraction for _, fraction in fractions if len(fraction) > 1]
     padded = any(fraction.startswith("0") for fraction in digits)
     rounded = any(fraction.endswith("0") for fraction in digits)
-    if padded or not rounded:  # a counter without leading zeros comes to a 10, a decimal number to none
+    if padded or not rounded:  # a counter without padding reaches 10, decimals have no trailing zero
         return decimal
     series: dict[str, set[int]] = {}
     for whole, fraction in fractions:
@@ -72,33 +72,32 @@ def in_order(files: Sequence[Path]) -> list[Path]:
 
 
 def pair_with_poses(files: Sequence[Path], trajectory: Trajectory) -> tuple[list[int], str]:
-    """Return the pose's row of each scan, and how it was found.
+    """Return the row of each scan's pose, and the method that found it.
 
     ``time``
-        A number in the names, with a point or so large that it counts no poses, is the time of a pose: in
+        A number in the names, with a point or too large for a count of poses, is the time of a pose in
         seconds, milliseconds, microseconds or nanoseconds.
     ``place``
-        Else, where there are as many poses as scans: the first scan has the first pose, and so on.
+        Else, with as many poses as scans: the first scan has the first pose, and so on.
     ``number``
-        Else a number in the names, which is another in each, counts the poses from 0: ``scan_0081`` has
-        the 82nd.
+        Else a number that differs in all names counts the poses from 0: ``scan_0081`` has the 82nd pose.
 
     Parameters
     ----------
     files
-        In their order.
+        Scans, in order.
     trajectory
-        Any order.
+        Poses, in any order.
 
     Raises
     ------
     BadRequest
-        None of these fits, two of them do not agree, or two scans would have one pose.
+        No method fits, two methods disagree, or two scans would have the same pose.
     """
     poses = len(trajectory)
     stems = [stem(path) for path in files]
     fitting: dict[tuple[int, ...], None] = {}
-    part = ""  # the name of a scan that has no pose near, where others have
+    part = ""  # name of a scan without a near pose, while others have one
     for numbers in _columns(stems):
         if not any("." in word or float(word) >= max(poses, 1) for word in numbers):
             continue
@@ -144,7 +143,7 @@ def _counters(text: str) -> list[tuple[int, float, str]]:
 
 
 def _columns(stems: Sequence[str]) -> list[list[str]]:
-    """Return the numbers that are another in each name, by their place in it; all must have as many."""
+    """Return the numbers that differ in all names, by position; all names must have equally many."""
     pattern = re.compile(f"{_DECIMAL.pattern}|[0-9]+")
     found = [pattern.findall(text) for text in stems]
     if len({len(numbers) for numbers in found}) != 1:
@@ -154,12 +153,12 @@ def _columns(stems: Sequence[str]) -> list[list[str]]:
 
 
 def _certain(numbers: Sequence[str]) -> bool:
-    """Whether these can only be times."""
+    """Return whether these numbers can only be times."""
     return any("." in word or float(word) >= _CLOCK for word in numbers)
 
 
 def _by_time(numbers: Sequence[str], trajectory: Trajectory) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return the pose nearest in time to each number, in the unit that fits best, and which are near."""
+    """Return the pose nearest in time to each number, in the best unit, and a mask of the near ones."""
     order = np.argsort(trajectory.stamps_s, kind="stable")
     stamps = trajectory.stamps_s[order]
     steps = np.diff(np.unique(stamps))
@@ -178,7 +177,7 @@ def _by_time(numbers: Sequence[str], trajectory: Trajectory) -> tuple[NDArray[np
 
 
 def _counting(files: Sequence[Path], stems: Sequence[str], poses: int) -> list[list[int]]:
-    """Return the rows that whole numbers in the names may mean; at least one choice."""
+    """Return possible rows for whole numbers in the names, at least one choice."""
     columns = _columns(stems)
     choices = [
         [int(word) for word in column]

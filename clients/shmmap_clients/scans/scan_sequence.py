@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The scans of a drive, one after the other, with their poses where these are known."""
+"""The scans of a drive in sequence, with poses if known."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ from shmmap_clients.scans.trajectory import Trajectory
 
 __all__ = ["Scan", "ScanSequence"]
 
-_PERIOD_S: Final = 0.1  # between scans without a time: that of most LiDARs
+_PERIOD_S: Final = 0.1  # period of scans without a time, as of most LiDARs
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scan:
-    """One scan.
+    """A scan.
 
     Attributes
     ----------
     name
-        For people: the file's name without its suffix, or what the sender calls it.
+        The file's name without its suffix, or the sender's name of the scan.
     stamp_s
-        Seconds.
+        Time, seconds.
     columns
-        ``xyz`` (N, 3) float32 or float64, sensor frame, metres; other columns of as many rows.
+        ``xyz`` (N, 3) float32 or float64, sensor frame, metres, and other columns with as many rows.
     T_map_sensor
-        (4, 4) float64; None where it is not known.
+        (4, 4) float64; None if unknown.
     no_map
-        Its points were filtered with a map, but there was none around it.
+        Whether the points were filtered with a map, but the map had no cells around them.
     rows
-        (N,) int64: which rows of the file or message the points are, where others were left out; else None.
+        (N,) int64: rows of the points in the file or message, if others were left out; else None.
     """
 
     name: str
@@ -57,12 +57,12 @@ class Scan:
 
     @property
     def pose(self) -> NDArray[np.float64]:
-        """Where it was taken: ``T_map_sensor``.
+        """Pose of the scan, ``T_map_sensor``.
 
         Raises
         ------
         BadRequest
-            That is not known.
+            The pose is unknown.
         """
         if self.T_map_sensor is None:
             raise BadRequest(f"scan {self.name} has no pose", hint="give poses with --poses FILE")
@@ -72,24 +72,24 @@ class Scan:
 class ScanSequence:
     """The scans in a directory (PCD, NPZ or ``.bin``), by name, ``s_9`` before ``s_10``.
 
-    They are read when their turn comes.
-    See `pair_with_poses` for which scan has which pose, and for their order then.
+    Each file is read when the iteration reaches it.  `pair_with_poses` defines the pose of each scan, and
+    the order of scans with poses.
 
     Parameters
     ----------
     directory
-        Of the scans.
+        Directory of the scans.
     trajectory
-        Their poses; None: scans have none, and times 0.1 s apart.
+        Poses of the scans; None: no poses, and times 0.1 s apart.
     reader
-        How files are read, and which points count; by default all that are finite.
+        Reader of files, which also filters points; by default it keeps all finite points.
 
     Attributes
     ----------
     files
-        In the order in which they come.
+        Files in the order of the iteration.
     pairing
-        How poses were found, the first and the last pair; empty without poses.
+        Description of the pairing with poses: method, first and last pair; empty without poses.
 
     Raises
     ------
@@ -132,13 +132,13 @@ class ScanSequence:
 
     @property
     def trajectory(self) -> Trajectory | None:
-        """Times and poses of the scans, in their order; None where they have none."""
+        """Times and poses of the scans, in order; None without poses."""
         if self._trajectory is None:
             return None
         return Trajectory(self._trajectory.stamps_s[self._rows], self._trajectory.T_map_sensor[self._rows])
 
     def leave_out(self, count: int) -> None:
-        """Begin after ``count`` scans."""
+        """Skip the first ``count`` scans."""
         del self.files[:count], self._rows[:count]
 
     def __iter__(self) -> Iterator[Scan]:

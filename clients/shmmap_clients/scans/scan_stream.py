@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scans over ZeroMQ: their source binds a publisher, their readers subscribe.
+"""Scans over ZeroMQ: the source binds a publisher, and readers subscribe.
 
 A message has a first frame in msgpack, ``{"shmmap_scan": 1, "name", "stamp_s", "pose", "columns"}``,
 and one frame of plain bytes for each column.  ``pose`` is null or 16 numbers, the rows of
 T_map_sensor; ``columns`` are ``[name, dtype, shape]`` with numpy's dtype strings (``"<f4"``), in the
-order of the frames.  ``"no_map": true`` comes with a filtered scan that had no map around it.
-``"last": true`` (without columns) says that no more scans come; it may be repeated until its reader
-unsubscribes.
+order of the frames.  ``"no_map": true`` marks a filtered scan without map around it.
+``"last": true`` (without columns) marks the end of the stream; it may be repeated until readers unsubscribe.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from shmmap_clients.streams import Publisher, Subscriber
 __all__ = ["ScanPublisher", "ScanSubscriber", "decode_scan", "encode_scan"]
 
 _VERSION: Final = 1
-_QUEUE: Final = 64  # scans that wait for a slow reader; what comes meanwhile is lost
+_QUEUE: Final = 64  # scans queued for a slow reader; further scans are dropped
 _LINGER_MS: Final = 10_000
 
 
@@ -61,7 +60,7 @@ def decode_scan(frames: list[bytes]) -> Scan | None:
     Raises
     ------
     BadRequest
-        The frames are no scan.
+        The frames are not a scan.
     """
     try:
         head = _decoder.decode(frames[0])
@@ -91,7 +90,7 @@ def decode_scan(frames: list[bytes]) -> Scan | None:
 
 
 class ScanPublisher(Publisher):
-    """Sends scans to all subscribers.
+    """Publisher of scans.
 
     Parameters
     ----------
@@ -108,22 +107,22 @@ class ScanPublisher(Publisher):
         super().__init__(endpoint, queue=_QUEUE, linger_ms=_LINGER_MS)
 
     def send(self, scan: Scan | None) -> None:
-        """Send a scan; None: the last one was sent."""
+        """Send a scan; None marks the end of the stream."""
         self.publish(encode_scan(scan), last=scan is None)
 
 
 class ScanSubscriber(Subscriber):
-    """Scans from a publisher: iterate until it has sent the last one, which ends the subscription.
+    """Iterator over the scans of a publisher; the end of the stream also ends the subscription.
 
     Parameters
     ----------
     endpoint
-        Its address.
+        Address of the publisher.
 
     Raises
     ------
     BadRequest
-        The address makes no sense.
+        The address is invalid.
     """
 
     def __init__(self, endpoint: str) -> None:

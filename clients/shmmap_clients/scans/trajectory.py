@@ -68,7 +68,7 @@ def pose_of(numbers: Sequence[float]) -> NDArray[np.float64]:
     Raises
     ------
     BadRequest
-        They are no rotation and translation.
+        The numbers are not a rotation and translation.
     """
     T = np.array(numbers, np.float64)
     # components first: their products may overflow
@@ -84,7 +84,7 @@ def pose_of(numbers: Sequence[float]) -> NDArray[np.float64]:
 def quaternion_of(rotation: NDArray[np.float64]) -> tuple[float, float, float, float]:
     """Return the quaternion (x, y, z, w) of a (3, 3) rotation, w not negative.
 
-    The largest component is found first, so that none is lost to rounding (Shepperd 1978).
+    The largest component is computed first, which avoids loss of precision (Shepperd 1978).
     """
     r = rotation
     trace = float(r[0, 0] + r[1, 1] + r[2, 2])
@@ -106,7 +106,7 @@ def quaternion_of(rotation: NDArray[np.float64]) -> tuple[float, float, float, f
 
 
 def tum_line(stamp_s: float, T_map_sensor: NDArray[np.float64]) -> str:
-    """Return one line of the format, without its end."""
+    """Return one line of the format, without the newline."""
     numbers = (*T_map_sensor[:3, 3], *quaternion_of(T_map_sensor[:3, :3]))
     return " ".join([f"{stamp_s:.9f}", *(f"{float(v):.9f}" for v in numbers)])
 
@@ -119,7 +119,7 @@ def read_trajectory(path: str | os.PathLike[str]) -> Trajectory:
     MapMissing
         There is no such file.
     MapDataError
-        A line is not eight numbers, or its rotation is none (the message names the line), or there is none.
+        A line is not eight numbers or has no valid rotation (the message names it), or the file has no lines.
     """
     name = os.fspath(path)
     stamps: list[float] = []
@@ -158,16 +158,16 @@ def read_route(path: str | os.PathLike[str]) -> NDArray[np.float64]:
     Parameters
     ----------
     path
-        A name that ends in ``.csv``: a place a line, ``x,y`` and perhaps more; or with a first line that
-        names the columns, ``x`` and ``y`` among them.  Empty lines and what follows a ``#`` are skipped.
-        Any other name: poses as `read_trajectory` reads them.
+        A file with suffix ``.csv`` has a position a line, ``x,y`` and perhaps more, or a first line with
+        the names of columns, including ``x`` and ``y``.  Empty lines and text after a ``#`` are skipped.
+        Any other file has poses as in `read_trajectory`.
 
     Raises
     ------
     MapMissing
         There is no such file.
     MapDataError
-        It cannot be read, a line has no two finite numbers (the message names the line), or there is none.
+        The file cannot be read or is empty, or a line lacks two finite numbers (the message names it).
     """
     name = os.fspath(path)
     if not name.lower().endswith(".csv"):

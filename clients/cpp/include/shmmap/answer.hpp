@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What comes of a request.
+// Results of a request.
 
 #ifndef SHMMAP_ANSWER_HPP
 #define SHMMAP_ANSWER_HPP
@@ -16,24 +16,24 @@
 
 namespace shmmap {
 
-/// A cell that could not be handed out, and why: `unknown_cell`, `load_failed`, `load_timeout`, `over_budget`,
-/// `no_space`, `offline`; take any other code for `load_failed`.
+/// A cell that the daemon could not provide, and why: `unknown_cell`, `load_failed`, `load_timeout`, `over_budget`,
+/// `no_space`, `offline`; treat any other code as `load_failed`.
 struct Failure {
   std::string id, layer, code, message;
-  std::optional<Box> box = std::nullopt;  ///< where the cell lies, if that is known
+  std::optional<Box> box = std::nullopt;  ///< of the cell, if known
 };
 
-/// What came of a request.
+/// Result of a request for cells.
 struct Answer {
   std::vector<CellPtr> cells;
-  std::vector<std::string> removed;                           ///< of what was held by id
-  std::vector<std::uint64_t> removed_versions;                ///< of what was held packed
-  std::vector<std::pair<std::string, std::string>> pending;   ///< id and layer of what is being loaded
+  std::vector<std::string> removed;                           ///< ids that the client should drop
+  std::vector<std::uint64_t> removed_versions;                ///< packed versions that the client should drop
+  std::vector<std::pair<std::string, std::string>> pending;   ///< id and layer of cells being loaded
   std::vector<Failure> failed;
-  std::vector<std::string> layers;  ///< those asked for, in canonical form
+  std::vector<std::string> layers;  ///< requested layers, in canonical form
   std::uint64_t epoch = 0, map_version = 0;
-  bool covered = true;  ///< false: part of what was asked for is not known yet, ask again
-  std::string reason;   ///< then `offline` where that cannot be reached at present, else empty
+  bool covered = true;  ///< false: part of the area is not known yet, ask again
+  std::string reason;   ///< then `offline` if that part cannot be reached now, else empty
 };
 
 /// What a client has: the cell's id and its version (none: the current one), of these layers; no layers means all

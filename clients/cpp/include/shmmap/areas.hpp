@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Where cells are wanted, and where the client is.  Metres in the frame of the map.
+// Requested areas, and the pose of the client.  Metres in the frame of the map.
 
 #ifndef SHMMAP_AREAS_HPP
 #define SHMMAP_AREAS_HPP
@@ -17,7 +17,7 @@
 
 namespace shmmap {
 
-/// Lowest and highest z of an area, metres; a cell whose bounds are not known yet belongs to it.
+/// Lowest and highest z of an area, metres; it includes cells whose bounds are not known yet.
 struct ZRange {
   double min = 0.0, max = 0.0;
 };
@@ -42,12 +42,12 @@ struct Box {
 
 using Area = std::variant<Circle, Square, Box>;
 
-/// Where the client is and is going: it decides what the daemon fetches before it is asked for, and what stays in
-/// memory longest.  Metres, m/s (both 0: the daemon learns them from the poses), radians.
+/// Pose and motion of the client, by which the daemon decides what to prefetch, and what to keep in memory
+/// longest.  Metres, m/s (both 0: the daemon learns them from the poses), radians.
 struct Intent {
   double x = 0.0, y = 0.0, vx = 0.0, vy = 0.0;
   std::optional<double> heading = std::nullopt;
-  /// The polyline ahead, to be given with every pose; of more than 512 places 512 are sent, equally far apart.
+  /// The polyline ahead, required with every pose; above 512 points, 512 equally spaced ones are sent.
   std::vector<std::array<double, 2>> route = {};
 };
 
@@ -58,10 +58,10 @@ struct Sides {
   double min_x = 0.0, min_y = 0.0, max_x = 0.0, max_y = 0.0;
 };
 
-/// A number as it is in a message of Autoware's.
+/// A number rounded as in a message of Autoware.
 inline double as_float(double value) { return static_cast<double>(static_cast<float>(value)); }
 
-/// The smallest rectangle around an area; a square's has what Autoware's float messages make of it.
+/// The smallest rectangle around an area; for a square, with the rounding of Autoware's float messages.
 inline Sides bounds(const Area& area) {
   if (const auto* box = std::get_if<Box>(&area)) return {box->min_x, box->min_y, box->max_x, box->max_y};
   const auto around = [](double x, double y, double radius) {
@@ -86,12 +86,12 @@ inline bool lies_in(const Sides& inner, const Sides& outer) {
          inner.max_y <= outer.max_y;
 }
 
-/// Whether a circle lies wholly in an area, as far as one can be sure of it.
+/// Whether a circle is certainly within an area.
 inline bool contains_circle(const Area& area, double x, double y, double radius) {
   if (const auto* circle = std::get_if<Circle>(&area))
     return std::hypot(x - circle->x, y - circle->y) + radius <= circle->radius;
   const Sides sides = bounds(area);
-  if (std::holds_alternative<Square>(area)) {  // by so much a box may be rounded away
+  if (std::holds_alternative<Square>(area)) {  // margin for the rounding of a box
     const auto most = static_cast<float>(std::max({std::abs(sides.min_x), std::abs(sides.min_y),
                                                    std::abs(sides.max_x), std::abs(sides.max_y)}));
     radius += static_cast<double>(std::nextafter(most, std::numeric_limits<float>::infinity()) - most);
@@ -115,10 +115,10 @@ inline bool overlaps(const Area& area, const Sides& cell) {
          as_float(cell.min_y) - radius <= y && y <= as_float(cell.max_y) + radius;
 }
 
-/// A route of at most 512 places: itself, or places equally far apart along it, its ends among them.
+/// A route of at most 512 points: unchanged, or equally spaced points along it, including its ends.
 inline std::vector<std::array<double, 2>> thinned(std::vector<std::array<double, 2>> route) {
   constexpr std::size_t max_places = 512;
-  constexpr double farthest_m = 1e8;  // what is farther away counts as this, as in the daemon
+  constexpr double farthest_m = 1e8;  // larger distances are clamped to this, as in the daemon
   if (route.size() <= max_places) return route;
   std::vector<double> along(route.size(), 0.0);
   for (auto& place : route)

@@ -1,25 +1,24 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// shmmap in Autoware's nodes: what its scan matcher asks of the map loader's service, without the service.
+// shmmap in Autoware's nodes: replaces the scan matcher's requests to the map loader's service.
 //
 //     using Service = autoware_map_msgs::srv::GetDifferentialPointCloudMap;
 //     shmmap::PcdLoader<Service> loader;                  // is a `PcdLoaderFunction`
 //     auto response = loader(request);                    // cells to add, ids to remove; or nullptr
 //
-//     shmmap::NdtLeaves<Leaf> leaves(2.0);                // the same with voxels, which are computed already
+//     shmmap::NdtLeaves<Leaf> leaves(2.0);                // the same with precomputed voxels
 //     if (auto found = leaves(request)) use(found->grids_to_add, found->ids_to_remove);
 //
-// Nothing of ROS, PCL or Eigen is included: messages and leaves are whatever has members of these names.
+// Includes no headers of ROS, PCL or Eigen: any types with members of these names work as messages and leaves.
 //
-// Autoware's `cached_ids` say which cells a node has, and not in which version.  So these objects remember
-// the version of each cell that they handed out, and a cell that has changed in the map comes again under its
-// id.  So use one object for each thing that keeps cells, and take over as a whole what it returns.
-// Copies share one memory and one connection.  A node's one thread may use them as well as several: a second
-// call waits for the first one to end.
+// Autoware's `cached_ids` name the cells of a node, but not their versions.  So these objects remember the
+// version of each cell that they returned, and return a changed cell again under its id.  Use one object for
+// each holder of cells, and apply every result completely.  Copies share one state and one connection, and
+// several threads may use them: a second call waits for the end of the first.
 //
-// They never throw.  Cells are waited for, because a node that was given nothing, or a part, asks again only
-// 20 m further on: `LoaderOptions::wait` seconds for cells that are being loaded, or until there is a daemon;
-// and `Options::timeout` seconds more if it does not answer at all.
+// These objects never throw.  A call waits for cells, because a node with none or a part of them sends its next
+// request only 20 m further on.  It waits `LoaderOptions::wait` seconds for cells being loaded or for a daemon,
+// and `Options::timeout` seconds more if the daemon does not answer at all.
 
 #ifndef SHMMAP_AUTOWARE_HPP
 #define SHMMAP_AUTOWARE_HPP
@@ -35,28 +34,28 @@
 
 namespace shmmap {
 
-/// How cells are asked for.
+/// Options of requests for cells.
 struct LoaderOptions {
-  Options client = {};  ///< how the daemon is found
+  Options client = {};  ///< how to find the daemon
   double wait = 10.0;   ///< seconds, at most 3600; see above
-  /// Gets a line about what could not be loaded.  It is called in the caller's thread.
+  /// Called in the caller's thread with a line about cells that could not be loaded.
   std::function<void(const std::string&)> log = {};
-  /// Asked ten times a second while a call waits: where it returns false the call ends with what has come by then.
-  /// Of a node: `[] { return rclcpp::ok(); }`, so that no request delays its end.
+  /// Called ten times a second while a call waits; if it returns false, the call ends with the cells so far.
+  /// In a node: `[] { return rclcpp::ok(); }`, so that no request delays its shutdown.
   std::function<bool()> keep_waiting = {};
 };
 
 namespace detail {
 
-/// What changes for a node that holds cells.
+/// Changes for a node that holds cells.
 template <typename Made>
 struct Difference {
   std::map<std::string, Made> added;  ///< by id, which is the order of Autoware's loader
-  std::vector<std::string> removed;   ///< in the order in which they were held; never one of `added`
+  std::vector<std::string> removed;   ///< in the order of the held ids; none of `added`
   std::string frame_id;
 };
 
-/// Remembers the versions of the cells that a caller holds by id, and asks for those that it lacks.
+/// Remembers the versions of the cells that a caller holds by id, and requests missing ones.
 class HeldCells {
  public:
   HeldCells(LoaderOptions options, std::string layer)
@@ -64,15 +63,15 @@ class HeldCells {
     if (options_.keep_waiting) options_.client.keep_waiting = options_.keep_waiting;
   }
 
-  /// What `cached` lacks of an area, each cell as `make` makes it out of the mapped one, and what it has in
-  /// vain; no value, and nothing forgotten, where something is missing and no other cell has come.  Cells are
-  /// released as soon as they are made: an area may be larger than the daemon's memory.
+  /// Cells of an area that `cached` lacks, each converted by `make` from the mapped cell, and ids to remove.
+  /// No value, with unchanged state, if cells are missing and no new one has arrived.  Each mapped cell is
+  /// released after its conversion, so that an area may be larger than the daemon's memory.
   template <typename Make, typename Made = std::invoke_result_t<const Make&, const Cell&>>
   std::optional<Difference<Made>> difference(const Area& area, const std::vector<std::string>& cached,
                                              const Make& make) {
     const std::lock_guard<std::mutex> one_at_a_time(mutex_);
     Difference<Made> found;
-    std::map<std::string, std::uint64_t> held;  // of `cached`, and of what comes: that whose version is known
+    std::map<std::string, std::uint64_t> held;  // cells of `cached` with known versions, and new cells
     std::set<std::string> gone, missing;
     bool covered = false;
     std::string trouble;
@@ -100,7 +99,7 @@ class HeldCells {
             found.added.insert_or_assign(cell->id, make(*cell));
             held[cell->id] = cell->version;
             gone.erase(cell->id);
-          } catch (const Error& error) {  // one cell must not cost the others
+          } catch (const Error& error) {  // the other cells are still usable
             lacks(cell->id, error.what());
           }
         }
@@ -110,14 +109,14 @@ class HeldCells {
           no_room = no_room || failure.code == "over_budget" || failure.code == "no_space";
         }
         for (const auto& [id, layer] : answer.pending) lacks(id, id + ": it is still being loaded");
-        // room comes from cells that are released here; and for a map that is not known yet no request waits
+        // released cells make room; and requests do not wait for a map that is not known yet
         again = (!covered || !answer.pending.empty() || (no_room && !answer.cells.empty())) &&
                 Clock::now() < until && is_wanted();
         if (again && answer.cells.empty()) ::poll(nullptr, 0, 20);
       }
       if (!covered && trouble.empty()) trouble = "not all of the map is known yet";
       if (missing.size() > 1) trouble += "; cells missing in all: " + std::to_string(missing.size());
-    } catch (const std::exception& error) {  // what came before it counts
+    } catch (const std::exception& error) {  // keep the cells before the error
       client_.reset();
       covered = false;
       trouble = error.what();
@@ -126,7 +125,7 @@ class HeldCells {
     if (!trouble.empty() && found.added.empty()) return std::nullopt;
     std::set<std::string> seen;
     for (const auto& id : cached) {
-      // what was not handed out here was not asked for: it is replaced, or nothing of the area
+      // a cell without known version was not requested: it is replaced, or not in the area
       const bool is_foreign = versions_.count(id) == 0 && covered && missing.count(id) == 0;
       if (found.added.count(id) == 0 && (is_foreign || gone.count(id) != 0) && seen.insert(id).second)
         found.removed.push_back(id);
@@ -135,7 +134,7 @@ class HeldCells {
     return found;
   }
 
-  /// Log what went wrong; an error in the caller's function does not end its node.
+  /// Log an error; an exception of the caller's log function does not end its node.
   void say(const std::string& message) const noexcept {
     try {
       if (options_.log) options_.log("shmmap: " + message);
@@ -152,7 +151,7 @@ class HeldCells {
         client_.emplace(options_.client);
       } catch (const Unreachable& error) {
         if (error.code() == "no_permission" || Clock::now() >= until || !is_wanted()) throw;
-        ::poll(nullptr, 0, 20);  // it does not announce when it listens
+        ::poll(nullptr, 0, 20);  // a starting daemon sends no notification
       }
     }
     std::vector<Held> have;
@@ -169,7 +168,7 @@ class HeldCells {
   std::map<std::string, std::uint64_t> versions_;
 };
 
-/// Autoware's area, of messages of any kind: a square, whatever its fields are called.
+/// The square of Autoware's area, from any message type.
 template <typename Request>
 Square area_of(const Request& request) {
   return {static_cast<double>(request.area.center_x), static_cast<double>(request.area.center_y),
@@ -185,7 +184,7 @@ std::vector<std::string> ids_of(const Request& request) {
 
 // --- points ----------------------------------------------------------------------------------------------
 
-/// Answers `GetDifferentialPointCloudMap` requests: what Autoware calls a `PcdLoaderFunction`.
+/// Answers `GetDifferentialPointCloudMap` requests, as a `PcdLoaderFunction` of Autoware.
 ///
 /// `Service` is `autoware_map_msgs::srv::GetDifferentialPointCloudMap`, or anything that has a `Request` and
 /// a `Response` of that shape.
@@ -197,9 +196,9 @@ class PcdLoader {
   explicit PcdLoader(LoaderOptions options = {})
       : cells_(std::make_shared<detail::HeldCells>(std::move(options), "points")) {}
 
-  /// What of the area the node does not hold in the version that the map has now, and which ids to remove;
-  /// nullptr where it could not be fetched.  Cells come in the order of their ids, their points as Autoware's
-  /// loader has them; `header.frame_id` is the map's, stamps are 0.  `request` is a pointer of any kind.
+  /// Cells of the area that the node lacks in the present version, and ids to remove; nullptr if they could not
+  /// be fetched.  Cells are in the order of ids, with points as from Autoware's loader; `header.frame_id` is the
+  /// map's, stamps are 0.  `request` is any kind of pointer.
   template <typename RequestPointer>
   std::shared_ptr<Response> operator()(const RequestPointer& request) const noexcept {
     try {
@@ -236,12 +235,12 @@ class PcdLoader {
 // --- voxels ----------------------------------------------------------------------------------------------
 
 /// The voxels of a cell's `ndt` layer as Autoware's `MultiVoxelGridCovariance::Leaf`, or anything with
-/// members `nr_points_`, `mean_`, `centroid_` and `icov_` that are used as there.
+/// members `nr_points_`, `mean_`, `centroid_` and `icov_` of the same meaning.
 ///
 /// Voxels are in Autoware's order (x fastest, then y, then z), of at least 6 points each, unless the layer's
-/// `min_points` says otherwise.  One whose covariance has no inverse has zeros in `icov_` and -1 points.
+/// `min_points` says otherwise.  A voxel whose covariance has no inverse has zeros in `icov_` and -1 points.
 /// `centroid_` is `mean_` rounded to float32, where Autoware sums in float32: far from the map's origin its
-/// sum is centimetres off.  Covariances are not filled in: once there is an inverse, nothing reads them.
+/// sum is centimetres off.  Covariances are not filled in, because only their inverses are read.
 template <typename Leaf>
 std::vector<Leaf> ndt_leaves(const Cell& cell) {
   const auto mean = cell.column<double>("mean"), inverse = cell.column<double>("inverse_covariance");
@@ -272,7 +271,7 @@ std::vector<Leaf> ndt_leaves(const Cell& cell) {
   return leaves;
 }
 
-/// Voxels where `PcdLoader` has points: the same requests, without making voxels.
+/// Like `PcdLoader`, but with voxels instead of points, which need not be computed.
 template <typename Leaf>
 class NdtLeaves {
  public:
@@ -289,7 +288,7 @@ class NdtLeaves {
   explicit NdtLeaves(double resolution = 2.0, LoaderOptions options = {})
       : cells_(std::make_shared<detail::HeldCells>(std::move(options), layer(resolution))) {}
 
-  /// As `PcdLoader` does; no value where it could not be fetched.
+  /// Like `PcdLoader`; no value if the cells could not be fetched.
   template <typename RequestPointer>
   std::optional<Update> operator()(const RequestPointer& request) const noexcept {
     try {
@@ -309,7 +308,7 @@ class NdtLeaves {
  private:
   static std::string layer(double resolution) {
     std::ostringstream spec;
-    spec.imbue(std::locale::classic());  // a point, whatever the program's language is
+    spec.imbue(std::locale::classic());  // a decimal point in any locale
     spec.precision(17);
     spec << "ndt(leaf=" << resolution << ")";
     return spec.str();

@@ -19,7 +19,7 @@
 
 namespace shmmap {
 
-/// One column as it lies in shared memory: `dtype` as numpy writes it, row-major, the first dimension is rows.
+/// One column in shared memory: `dtype` as numpy writes it, row-major, the first dimension is rows.
 struct Column {
   std::string name, dtype, unit;
   std::vector<std::uint64_t> shape;
@@ -28,15 +28,15 @@ struct Column {
   std::uint64_t checksum = 0;
 };
 
-/// The values of a column; they live as long as their cell.
+/// The values of a column, valid as long as their cell.
 template <typename T>
 class Values {
  public:
   Values(const T* data, std::size_t rows, std::size_t width) : data_(data), rows_(rows), width_(width) {}
   [[nodiscard]] const T* data() const noexcept { return data_; }
-  /// Of each point, voxel or field.
+  /// Number of rows: points, voxels or fields.
   [[nodiscard]] std::size_t rows() const noexcept { return rows_; }
-  /// Values of one row: 3 of `xyz`.
+  /// Number of values in a row: 3 for `xyz`.
   [[nodiscard]] std::size_t width() const noexcept { return width_; }
   [[nodiscard]] std::size_t size() const noexcept { return rows_ * width_; }
   [[nodiscard]] const T* begin() const noexcept { return data_; }
@@ -49,8 +49,8 @@ class Values {
   std::size_t rows_, width_;
 };
 
-/// The voxels that a computed layer's rows lie on: edges in metres (infinite: not divided along that axis),
-/// index of the first one of the box that is occupied, and that box's voxels along x, y, z.
+/// The lattice of a computed layer's rows: edges in metres (infinite: not divided along that axis), index of the
+/// first voxel of the occupied box, and number of voxels of this box along x, y, z.
 struct Lattice {
   std::array<double, 3> leaf{};
   std::array<std::int64_t, 3> first{};
@@ -60,20 +60,20 @@ struct Lattice {
 /// One layer of one map cell, mapped for reading.
 class Cell {
  public:
-  std::string id;  ///< whole: as Autoware's `cell_id`
+  std::string id;  ///< complete, as Autoware's `cell_id`
   std::string layer;
-  std::uint64_t version = 0;  ///< with the layer it names the bytes, also across restarts
+  std::uint64_t version = 0;  ///< identifies the bytes together with the layer, also across restarts
   double min_x = 0.0, min_y = 0.0, max_x = 0.0, max_y = 0.0;
-  double z_min = 0.0, z_max = 0.0;  ///< of its points; NaN where there are none
+  double z_min = 0.0, z_max = 0.0;  ///< of its points; NaN without points
   bool stale = false;               ///< the map has a newer version that could not be loaded yet
   std::uint64_t rows = 0;
   std::uint64_t source_points = 0, dropped_points = 0;
-  std::array<double, 3> origin{};  ///< what to add to the coordinates
+  std::array<double, 3> origin{};  ///< to add to the coordinates
   std::string frame_id;
   std::optional<Lattice> lattice;
   std::vector<Column> columns;
 
-  /// A column by name; throws NoColumn, and BadRequest where its values are of another type.
+  /// A column by name; throws NoColumn, and BadRequest if its values have another type.
   template <typename T>
   [[nodiscard]] Values<T> column(std::string_view name) const {
     const Column& found = this->named(name);
@@ -86,7 +86,7 @@ class Cell {
                      count != 0 ? values / count : 0);
   }
 
-  /// A column by name, whatever its values are; throws NoColumn.
+  /// A column by name, with any type of values; throws NoColumn.
   [[nodiscard]] const Column& named(std::string_view name) const {
     for (const Column& one : columns)
       if (one.name == name) return one;

@@ -38,7 +38,7 @@
 namespace shmmap {
 
 namespace detail {
-using CellKey = std::pair<std::uint64_t, std::string>;  // version and layer, which name the bytes
+using CellKey = std::pair<std::uint64_t, std::string>;  // version and layer, which identify the bytes
 
 struct HashOfCellKey {
   std::size_t operator()(const CellKey& key) const noexcept {
@@ -46,7 +46,7 @@ struct HashOfCellKey {
   }
 };
 
-/// Unmapped by any thread, and not yet reported to the daemon.
+/// Versions unmapped by any thread, and not yet reported to the daemon.
 class Unmapped {
  public:
   void add(const CellKey& key) noexcept {
@@ -70,17 +70,17 @@ class Unmapped {
 
 /// How a client finds the daemon, and its own name and limits.
 struct Options {
-  std::string endpoint = {};  ///< the socket's path; empty: the environment says, as for every client
-  std::string name = {};      ///< how the program is listed (`shmmap top`); at most 64 characters
+  std::string endpoint = {};  ///< the socket's path; empty: from the environment, as for every client
+  std::string name = {};      ///< name of the program in `shmmap top`; at most 64 characters
   std::string shm_dir = {};   ///< where this process finds segments; empty: `SHMMAP_SHM_DIR`, or as the daemon says
-  double timeout = 5.0;       ///< seconds to wait for an answer, beyond those that the daemon may take
-  /// Asked ten times a second while a request waits; where it returns false the request ends with `Interrupted`.
+  double timeout = 5.0;       ///< seconds to wait for an answer, beyond the `wait` of a request
+  /// Called ten times a second while a request waits; if it returns false, the request ends with `Interrupted`.
   std::function<bool()> keep_waiting = {};
 };
 
 namespace detail {
 
-/// A request whose answer may be taken in a later call than the one that sent it.
+/// A request whose answer a later call may receive.
 struct Exchange {
   std::uint64_t number = 0;
   std::string message;
@@ -89,7 +89,7 @@ struct Exchange {
   Clock::time_point since = Clock::now();  // or since the connection was lost
   Clock::time_point repeat_at = {};        // on silence
   double pause = 0.0;                      // until then; 0: it has not been sent on this connection
-  std::string reply = {};                  // where it came while another answer was waited for
+  std::string reply = {};                  // if it arrived during the wait for another answer
 
   [[nodiscard]] Clock::time_point overdue(double timeout) const {
     return since + std::chrono::duration_cast<Clock::duration>(Seconds(std::min(wait + timeout, 1e6)));
@@ -107,14 +107,14 @@ inline std::string variable(const char* name) {
   return value != nullptr ? value : "";
 }
 
-/// Whether a directory that any user could have made is this user's own.
+/// Whether a directory that any user could have created belongs to this user.
 inline bool is_private(const std::string& directory) {
   struct stat status {};
   return ::lstat(directory.c_str(), &status) == 0 && S_ISDIR(status.st_mode) && status.st_uid == ::geteuid() &&
          (status.st_mode & 077U) == 0;
 }
 
-/// The sockets to try, the first one first.
+/// The sockets to try, in this order.
 inline std::vector<std::string> endpoints(std::string given) {
   if (given.empty()) given = variable("SHMMAP_ENDPOINT");
   if (given.compare(0, 6, "ipc://") == 0) given.erase(0, 6);
@@ -123,7 +123,7 @@ inline std::vector<std::string> endpoints(std::string given) {
   const std::string file = "/" + (named.empty() ? "default" : named) + ".sock";
   if (!directory.empty()) return {directory + file};
   std::vector<std::string> found;
-  const std::string users = variable("XDG_RUNTIME_DIR");  // one that is not absolute is to be ignored
+  const std::string users = variable("XDG_RUNTIME_DIR");  // ignored if not absolute
   if (!users.empty() && users[0] == '/') found.push_back(users + "/shmmap" + file);
   const std::string fallback = "/tmp/shmmap-" + std::to_string(::geteuid());
   if (is_private(fallback)) found.push_back(fallback + file);
@@ -140,14 +140,14 @@ class Client {
 
   /// Find the daemon and open a session; throws Unreachable, ProtocolMismatch, Refused.
   explicit Client(Options options = {}) : Client(std::move(options), nullptr) {
-    std::optional<Unreachable> first;  // of several refusals the first one where there is something at all
+    std::optional<Unreachable> first;  // the first error of a socket that exists
     for (auto& path : std::exchange(paths_, {})) {
       try {
         paths_ = {std::move(path)};
         connect();
         return;
       } catch (const Unreachable& error) {
-        if (error.code() == "no_answer") throw;  // it is there: the next one might serve another map
+        if (error.code() == "no_answer") throw;  // a daemon exists: the next socket might serve another map
         if (!first || first->code() == "no_socket") first = error;
       }
     }
@@ -158,12 +158,12 @@ class Client {
   ~Client() {
     try {
       if (socket_.is_open() && !hello_) socket_.send(begun("bye", next_request(), 0).data());
-    } catch (const std::exception&) {  // it is over anyway
+    } catch (const std::exception&) {  // the session ends anyway
     }
   }
 
-  /// All cells of an area, and what of them could not be loaded.  `wait`: seconds that the daemon may take to load
-  /// (at most 3600); none: what is in memory, the rest is `pending` and being loaded.
+  /// All cells of an area, with errors for those that could not be loaded.  `wait`: seconds that the daemon may
+  /// take to load (at most 3600); none: only cells in memory, the others are `pending` and being loaded.
   Answer area(const Area& area, const std::vector<std::string>& layers = {"points"},
               std::optional<double> wait = default_wait, const std::optional<Intent>& intent = std::nullopt) {
     return cells("area", wait, [&](detail::Writer& to) {
@@ -174,8 +174,8 @@ class Client {
     }, 4);
   }
 
-  /// What of an area the client does not hold, and what it holds in vain: apply removals before additions.
-  /// `packed` are versions alone, each of one layer of one cell.
+  /// Cells of an area that the client lacks, and cells that it should drop; apply removals before additions.
+  /// `packed` has only versions, each of one layer of one cell.
   Answer differential(const Area& area, const std::vector<Held>& held, const std::vector<std::uint64_t>& packed = {},
                       const std::vector<std::string>& layers = {"points"},
                       std::optional<double> wait = default_wait,
@@ -203,7 +203,7 @@ class Client {
     throw Unreachable("no_answer", path_ + ": the map changed each time before its list had come", "ask again");
   }
 
-  /// Report to the daemon at once what was unmapped; each request does so before.
+  /// Report unmapped cells to the daemon at once; each request does so first.
   void release() {
     report_unmapped();
     const auto number = next_request();
@@ -215,7 +215,7 @@ class Client {
 
   /// Number of the daemon's run.
   [[nodiscard]] std::uint64_t epoch() const noexcept { return welcome_.epoch; }
-  /// Which state of the map the last answer was about; 0 before the first one.
+  /// Version of the map in the last answer; 0 before the first one.
   [[nodiscard]] std::uint64_t map_version() const noexcept { return map_version_; }
   /// The session's number, as in `shmmap top`.
   [[nodiscard]] std::uint64_t session() const noexcept { return welcome_.session; }
@@ -224,7 +224,7 @@ class Client {
   [[nodiscard]] const std::string& frame_id() const noexcept { return welcome_.frame_id; }
   /// The connection's descriptor, for event loops: readable when the daemon has ended.
   [[nodiscard]] int fd() const noexcept { return socket_.fd(); }
-  /// Whether the connection stands, as far as the kernel knows; the next request makes another one.
+  /// Whether the connection is open, as far as the kernel knows; if not, the next request reconnects.
   [[nodiscard]] bool is_connected() const noexcept { return socket_.stands(); }
   /// The daemon's socket.
   [[nodiscard]] const std::string& path() const noexcept { return path_.empty() ? paths_.front() : path_; }
@@ -235,11 +235,11 @@ class Client {
   using Clock = detail::Clock;
 
   static constexpr double greeting_s = 1.0;
-  static constexpr std::size_t max_request_bytes = std::size_t{4} << 20;  // more ends the connection
-  static constexpr std::chrono::milliseconds look_again{20};  // for a daemon that does not listen
-  static constexpr double attach_s = 0.2;  // for the daemon to have looked at a segment
+  static constexpr std::size_t max_request_bytes = std::size_t{4} << 20;  // a larger request ends the connection
+  static constexpr std::chrono::milliseconds look_again{20};  // retry interval while no daemon listens
+  static constexpr double attach_s = 0.2;  // time for the daemon to check a segment
   static constexpr int attempts = 8;
-  static constexpr int rounds = 5;  // a listing is begun again when the map has changed meanwhile
+  static constexpr int rounds = 5;  // a listing restarts if the map has changed meanwhile
   static constexpr std::uint64_t page_rows = 10'000;
 
   static Clock::time_point after(double seconds) {
@@ -276,7 +276,7 @@ class Client {
     if (exchange_) exchange_->pause = 0.0, exchange_->since = Clock::now();
   }
 
-  /// Connect where there is no connection; returns whether the daemon has said welcome, false if not until then.
+  /// Connect if there is no connection; returns whether the daemon has sent its welcome by then.
   bool is_welcome(Clock::time_point until) {
     if (!socket_.is_open()) greet();
     if (!hello_) return true;
@@ -292,7 +292,7 @@ class Client {
       throw;
     } catch (const Interrupted&) {
       throw;
-    } catch (const Error&) {  // the connection is of no use
+    } catch (const Error&) {  // the connection is unusable
       disconnect();
       throw;
     }
@@ -302,7 +302,7 @@ class Client {
     return true;
   }
 
-  /// Connect to the first socket at which a daemon listens, and say hello.
+  /// Connect to the first socket on which a daemon listens, and send hello.
   void greet() {
     std::optional<Unreachable> first;
     for (const auto& path : paths_) {
@@ -325,7 +325,7 @@ class Client {
     socket_.send(message.data());
   }
 
-  /// Receive until the answer to a request has come; false if it has not until then.  Throws what it says is wrong.
+  /// Receive until the answer to a request arrives; false if it has not by then.  Throws the error in it.
   bool is_answered(std::uint64_t number, std::string_view tag, std::string& reply, Clock::time_point until) {
     while (received(reply, until)) {
       detail::Reader reader(reply);
@@ -358,7 +358,7 @@ class Client {
     }
   }
 
-  /// Throws Interrupted where the program does not want to wait any longer.
+  /// Throws Interrupted if the program ends the wait.
   void check_waiting() const {
     if (options_.keep_waiting && !options_.keep_waiting())
       throw Interrupted("interrupted", path() + ": the program has ended the wait for the daemon's answer");
@@ -371,12 +371,12 @@ class Client {
                        "ask for fewer cells at a time, or send versions (packed) in place of names");
   }
 
-  /// Send a request until it is answered; `reply` is what came.
+  /// Send a request, repeatedly if necessary, until it is answered; `reply` receives the answer.
   void ask(std::uint64_t number, const std::string& message, std::string_view tag, double wait, std::string& reply) {
     check_size(message);
     const auto deadline = after(wait + options_.timeout);
     double pause = wait + 1.0;
-    bool may_be_back = true;  // the first time it is asked at once
+    bool may_be_back = true;  // the first retry is immediate
     while (true) {
       try {
         connect();
@@ -394,22 +394,22 @@ class Client {
         disconnect();
         if (error.code() == "no_answer" || error.code() == "no_permission" || Clock::now() >= deadline) throw;
         check_waiting();
-        if (!std::exchange(may_be_back, false)) ::poll(nullptr, 0, look_again.count());  // it does not announce when it listens
+        if (!std::exchange(may_be_back, false)) ::poll(nullptr, 0, look_again.count());  // it sends no notification
       }
     }
   }
 
   // --- a request that outlasts a call ---
 
-  /// Have a request sent by `is_finished`.
+  /// Prepare a request, which `is_finished` sends.
   void begin(std::uint64_t number, const std::string& message, std::string_view tag, double wait) {
     check_size(message);
     exchange_ = detail::Exchange{number, message, tag, wait};
   }
 
-  /// Go on with the request that was begun: connect, greet, send, receive.  Returns whether its answer is in `reply`;
-  /// false if it has not come until then.  Unreachable: it is sent when a daemon listens again, or is on its way still;
-  /// other errors are its answer.
+  /// Continue the prepared request: connect, greet, send, receive.  Returns whether its answer is in `reply`; false
+  /// if it has not arrived by then.  After Unreachable, the request remains pending, and is sent when a daemon
+  /// listens again; other errors are its answer.
   bool is_finished(std::string& reply, Clock::time_point until) {
     for (bool may_be_back = true;; may_be_back = false) {
       try {
@@ -457,7 +457,7 @@ class Client {
       if (is_answered(one.number, one.tag, reply, std::min(until, one.repeat_at))) return true;
       if (Clock::now() >= until) return false;
     }
-    reply = std::move(one.reply);  // it came while another answer was waited for
+    reply = std::move(one.reply);  // it arrived during the wait for another answer
     detail::Reader reader(reply);
     detail::Row row(reader);
     const auto kind = row.get().text();
@@ -533,7 +533,7 @@ class Client {
     for (std::size_t at = 0; at < places.size(); ++at) take(found.handles[at], at, places, gone, answer, limit());
     for (int attempt = 0; !gone.empty() && attempt < attempts && Clock::now() < deadline; ++attempt) {
       ask_again(found.handles, places, gone, answer);
-      if (!gone.empty()) check_visible();  // not at first: a daemon that ends takes all its segments away
+      if (!gone.empty()) check_visible();  // not at first: a daemon that ends removes all its segments
     }
     for (const auto at : gone) answer.pending.emplace_back(whole(found.handles[at].id), found.handles[at].layer);
     for (auto& cell : places)
@@ -570,7 +570,7 @@ class Client {
             std::vector<std::size_t>& gone, Answer& answer, Clock::time_point until) {
     try {
       places[at] = attached(handle, until);
-    } catch (const SegmentError& error) {  // one cell must not cost the others
+    } catch (const SegmentError& error) {  // the other cells are still usable
       if (error.code() == "stale_handle") gone.push_back(at);
       else if (error.code() == "segment_corrupt")
         answer.failed.push_back({whole(handle.id), handle.layer, "load_failed", error.what()});
@@ -578,7 +578,7 @@ class Client {
     }
   }
 
-  /// Ask again for the handles whose segments were gone before they could be attached.
+  /// Request the handles again whose segments were removed before they could be attached.
   void ask_again(std::vector<detail::Handle>& handles, std::vector<CellPtr>& places, std::vector<std::size_t>& gone,
                  Answer& answer) {
     std::vector<std::string> ids, layers;
@@ -621,7 +621,7 @@ class Client {
 
   [[nodiscard]] std::string statistics_path() const { return shm_dir() + welcome_.segment_prefix + "statistics"; }
 
-  /// Refuse a directory without the daemon's statistics: in a container it may be another one.
+  /// Refuse a directory without the daemon's statistics, since a container may have a different one.
   void check_visible() const {
     if (struct stat status {}; ::lstat(statistics_path().c_str(), &status) == 0 || !socket_.stands()) return;
     throw SegmentError("segment_error", "the daemon's segments are not in " + shm_dir() + ", as this process sees it",
@@ -653,7 +653,7 @@ class Client {
         throw SegmentError("segment_error", path + ": " + detail::error_text(errno));
       }
       const timespec pause{0, 200'000};
-      ::nanosleep(&pause, nullptr);  // the daemon looks at it in this moment, and says not when it is done
+      ::nanosleep(&pause, nullptr);  // the daemon is checking the segment, and does not report the end
     }
   }
 
@@ -674,7 +674,7 @@ class Client {
     lock.l_start = static_cast<off_t>(welcome_.session);
     lock.l_len = 1;
     static_assert(sizeof(off_t) == 8, "compile with -D_FILE_OFFSET_BITS=64");
-    ::fcntl(fd.get(), F_OFD_SETLK, &lock);  // NOLINT: without it the segment is as safe, and its user unknown
+    ::fcntl(fd.get(), F_OFD_SETLK, &lock);  // NOLINT: without the lock the segment is as safe, but its user unknown
     SHMMAP_FAILPOINT("client.lock");
     const auto size = static_cast<std::uint64_t>(status.st_size);
     if (handle.offset > size || handle.bytes > size - handle.offset || size - handle.offset < 4096)
@@ -720,12 +720,12 @@ class Client {
     return cell;
   }
 
-  /// Report to the daemon which versions are not mapped here any more: memory can be used again at once.
+  /// Report versions that are no longer mapped here, so that the daemon can reuse their memory at once.
   void report_unmapped() {
     std::vector<std::uint64_t> versions;
     for (const auto& key : unmapped_->take()) {
       const auto known = cells_.find(key);
-      if (known == cells_.end() || !known->second.expired()) continue;  // it was reported, or is mapped again
+      if (known == cells_.end() || !known->second.expired()) continue;  // already reported, or mapped again
       versions.push_back(key.first);
       cells_.erase(known);
     }
@@ -733,7 +733,7 @@ class Client {
     auto message = begun("release", next_request(), 1);
     message.binary(versions.data(), versions.size() * sizeof(std::uint64_t));
     try {
-      socket_.send(message.data());  // the answer has an id that is not waited for
+      socket_.send(message.data());  // nothing waits for the id of its answer
     } catch (const Unreachable&) {
       socket_ = detail::Socket();
     }
@@ -741,9 +741,9 @@ class Client {
 
   Options options_;
   std::vector<std::string> paths_;  // sockets to try
-  std::string path_;                // the one connected to
+  std::string path_;                // of the connection
   detail::Socket socket_;
-  std::optional<std::uint64_t> hello_;  // its number, while it is not answered
+  std::optional<std::uint64_t> hello_;  // number of the unanswered hello
   std::optional<detail::Exchange> exchange_;
   detail::Welcome welcome_;
   std::uint64_t request_ = 0, map_version_ = 0;

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What can go wrong.
+// Exceptions.
 
 #ifndef SHMMAP_ERRORS_HPP
 #define SHMMAP_ERRORS_HPP
@@ -11,8 +11,8 @@
 
 namespace shmmap {
 
-/// What went wrong: `what()`; `code()` is the name that it has in the protocol and in Python, `hint()` says
-/// what to do, if that is known.
+/// An error: `what()` describes it, `code()` is its name in the protocol and in Python, and `hint()` is a remedy,
+/// if one is known.
 class Error : public std::runtime_error {
  public:
   Error(std::string code, const std::string& message, std::string hint = "")
@@ -26,19 +26,19 @@ class Error : public std::runtime_error {
   std::string code_, hint_;
 };
 
-/// The request cannot be answered, however often it is sent.
+/// The request is invalid, also if it is repeated.
 struct BadRequest : Error { using Error::Error; };
 /// There is no such column.
 struct NoColumn : BadRequest { using BadRequest::BadRequest; };
 /// No answer: `no_socket`, `no_permission`, `stale_socket`, `connection_lost` or `no_answer`.
 struct Unreachable : Error { using Error::Error; };
-/// `Options::keep_waiting` has ended a wait (`interrupted`).
+/// `Options::keep_waiting` ended a wait (`interrupted`).
 struct Interrupted : Error { using Error::Error; };
-/// The daemon speaks another version, or no shmmap at all.
+/// The peer speaks another version of the protocol, or is not shmmap.
 struct ProtocolMismatch : Error { using Error::Error; };
 /// The daemon refused: any other code.
 struct Refused : Error { using Error::Error; };
-/// A segment is not what its handle says: `segment_corrupt`, or `stale_handle` where it is gone.
+/// A segment differs from its handle: `segment_corrupt`, or `stale_handle` if it was removed.
 struct SegmentError : Error { using Error::Error; };
 
 }  // namespace shmmap

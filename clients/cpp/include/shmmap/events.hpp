@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What happens in the daemon, without missing anything unnoticed.  Events come on a socket of their own, numbered;
-// what is missing between two of them is asked for, and what the daemon does not remember any more is `MissedEvents`.
+// Events of the daemon, without unnoticed gaps.  Numbered events arrive on their own socket.  Missing ones are
+// requested, and those that the daemon no longer remembers are reported as `MissedEvents`.
 
 #ifndef SHMMAP_EVENTS_HPP
 #define SHMMAP_EVENTS_HPP
@@ -25,19 +25,19 @@
 
 namespace shmmap {
 
-/// One thing that happened: `kind` and its fields, by the names that PROTOCOL.md gives ("Events").
+/// One event: `kind` and its fields, by the names that PROTOCOL.md gives ("Events").
 struct Event {
   std::string kind;
-  std::uint64_t seq = 0;  ///< its number in its epoch, from 1 without gaps
+  std::uint64_t seq = 0;  ///< number within the epoch, from 1 without gaps
   std::uint64_t epoch = 0;
-  std::int64_t unix_ns = 0;  ///< wall clock when it happened
+  std::int64_t unix_ns = 0;  ///< wall-clock time of the event
   std::vector<std::pair<std::string, detail::Value>> fields;
 
-  /// A text by name, as `text("id")`; throws BadRequest where this kind has none of that name.
+  /// A text by name, as `text("id")`; throws BadRequest if this kind has no such text.
   [[nodiscard]] const std::string& text(std::string_view name) const { return get<std::string>(name); }
   /// A whole number by name, as `number("version")`.
   [[nodiscard]] std::uint64_t number(std::string_view name) const { return get<std::uint64_t>(name); }
-  /// Whatever it is: `std::uint64_t`, `double`, `bool` or `std::string`.
+  /// A value of any type: `std::uint64_t`, `double`, `bool` or `std::string`.
   template <typename T>
   [[nodiscard]] const T& get(std::string_view name) const {
     for (const auto& [field, value] : fields)
@@ -47,7 +47,7 @@ struct Event {
   }
 };
 
-/// Events that are lost: ask for cells again to learn what they reported.
+/// Lost events: request the cells again for the changes that they reported.
 struct MissedEvents {
   std::uint64_t epoch = 0, first = 0, last = 0;
 };
@@ -61,7 +61,7 @@ struct KindOfEvent {
   std::array<std::string_view, 9> fields;
 };
 
-/// Names of what stands in an event behind its kind, number, epoch and time.
+/// Names of the fields of an event after its kind, number, epoch and time.
 inline constexpr std::array<KindOfEvent, 17> kinds_of_events{{
     {"epoch", {"what", "map_version", "cells", "adopted"}},
     {"loaded", {"id", "layer", "version", "bytes", "points", "load_ns", "again", "replaces", "ahead"}},
@@ -82,7 +82,7 @@ inline constexpr std::array<KindOfEvent, 17> kinds_of_events{{
     {"live_changed", {"map", "change"}},
 }};
 
-/// An event; of a kind that this version does not know only the head is read.
+/// An event; of a kind unknown to this version, only the head is read.
 inline Event read_event(Row& row) {
   Event event;
   event.kind = row.get().text();
@@ -102,10 +102,10 @@ inline Event read_event(Row& row) {
 
 }  // namespace detail
 
-/// What happens in the daemon, in order.  After a restart of the daemon, events of its next run follow.
+/// The daemon's events, in order.  After a restart of the daemon, events of its next run follow.
 class EventStream {
  public:
-  /// `since`: begin with the events of the last `since` seconds, as far as the daemon remembers; none: now.
+  /// `since`: begin with the events of the last `since` seconds, as far as the daemon remembers; none: from now on.
   explicit EventStream(Options options = {}, std::optional<double> since = std::nullopt)
       : client_(std::move(options)), epoch_(client_.epoch()) {
     if (since && !(*since >= 0.0)) throw BadRequest("bad_request", "since is seconds, not below zero");
@@ -119,7 +119,7 @@ class EventStream {
     while (!catch_up(0, static_cast<std::uint64_t>(std::max(from, 0.0)))) epoch_ = recent(0, 0, 0).epoch;
   }
 
-  /// The next event, or what was missed; nothing if nothing happens within `timeout` seconds (0: what is there).
+  /// The next event, or a report of lost ones; nothing after `timeout` seconds (0: only events already here).
   std::optional<Happening> next(double timeout) {
     const auto until = Client::after(timeout);
     while (ready_.empty()) {
@@ -128,7 +128,7 @@ class EventStream {
         if (!socket_.is_open()) subscribe();
         if (!socket_.receive(message, until)) return std::nullopt;
         pause_ms_ = first_pause_ms;
-      } catch (const Unreachable&) {  // it ended; when the next one listens is unknown
+      } catch (const Unreachable&) {  // the daemon has ended; the start of the next one is unknown
         socket_ = detail::Socket();
         const auto left = std::chrono::duration_cast<std::chrono::milliseconds>(until - detail::Clock::now()).count();
         if (left <= 0) return std::nullopt;
@@ -143,7 +143,7 @@ class EventStream {
     return first;
   }
 
-  /// The daemon's present run.
+  /// Number of the daemon's present run.
   [[nodiscard]] std::uint64_t epoch() const noexcept { return epoch_; }
   /// For event loops: readable when `next(0.0)` may have something; -1 while the daemon is away.
   [[nodiscard]] int fd() const noexcept { return socket_.fd(); }
@@ -160,7 +160,7 @@ class EventStream {
     const auto& named = client_.welcome_.events;
     if (named.empty())
       throw ProtocolMismatch("protocol_mismatch", "this daemon publishes no events", "update it");
-    // in another mount namespace the directory has another name than the daemon knows
+    // in another mount namespace the directory may have a different path
     const auto& path = client_.path();
     const std::string beside = path.substr(0, path.rfind('/') + 1) + named.substr(named.rfind('/') + 1);
     socket_ = detail::Socket(::access(beside.c_str(), F_OK) == 0 ? beside : named, detail::ready_of_subscriber);
@@ -211,15 +211,15 @@ class EventStream {
     if (is_known(event)) ready_.emplace_back(std::move(event));
   }
 
-  /// Report what is missing up to this number as lost.
+  /// Report missing events up to this number as lost.
   void miss(std::uint64_t last) {
     if (last < expected_) return;
     ready_.emplace_back(MissedEvents{epoch_, expected_, last});
     expected_ = last + 1;
   }
 
-  /// Fetch what is missing; false if that is of a previous run of the daemon.  One that does not answer now has
-  /// more to say when it is back.
+  /// Fetch missing events; false if they are from a previous run of the daemon.  If the daemon does not answer now,
+  /// they are fetched when it is back.
   bool tried_to_catch_up() {
     try {
       return catch_up(expected_ - 1, 0);

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// A cell's points as a message of ROS.  Nothing of ROS is included: a message is whatever has the members of
-// `sensor_msgs/PointCloud2`.
+// A cell's points as a ROS message.  Includes no headers of ROS: any type with the members of
+// `sensor_msgs/PointCloud2` works as a message.
 
 #ifndef SHMMAP_POINT_CLOUD2_HPP
 #define SHMMAP_POINT_CLOUD2_HPP
@@ -25,7 +25,7 @@ namespace shmmap {
 
 namespace detail {
 
-/// A field of `sensor_msgs/PointCloud2`, and where its values are in shared memory.
+/// A field of `sensor_msgs/PointCloud2`, and its values in shared memory.
 struct PointField {
   std::string name;
   std::uint8_t datatype = 0;
@@ -34,7 +34,7 @@ struct PointField {
   std::size_t bytes = 0;  // of one point
 };
 
-/// `sensor_msgs/PointField`'s number of a dtype; 0 where it has none: integers of 64 bits, floats of 16.
+/// Number of a dtype in `sensor_msgs/PointField`; 0 if it has none (64-bit integers, 16-bit floats).
 inline std::uint8_t datatype_of(std::string_view dtype) {
   constexpr std::array<std::string_view, 8> known{"|i1", "|u1", "<i2", "<u2", "<i4", "<u4", "<f4", "<f8"};
   for (std::size_t at = 0; at < known.size(); ++at)
@@ -47,7 +47,7 @@ void spread(const unsigned char* from, std::size_t points, unsigned char* to, st
   for (; points > 0; --points, from += bytes, to += step) std::memcpy(to, from, bytes);
 }
 
-/// Put one field's values at their places in a number of points.
+/// Write one field's values into a block of points.
 inline void spread(const PointField& field, std::size_t first, std::size_t points, unsigned char* to,
                    std::size_t step) {
   const unsigned char* from = field.from + first * field.bytes;
@@ -73,8 +73,8 @@ void to_map_frame(const Cell& cell, const Values<Value>& xyz, std::vector<float>
   }
 }
 
-/// The fields of a cell's points, x, y, z first, each beside the one before; `xyz32` keeps coordinates that are not as
-/// in shared memory: PCL's points have 32 bits, and those of layers are relative to their origin.
+/// The fields of a cell's points, x, y, z first, without gaps.  `xyz32` holds converted coordinates: PCL's points
+/// have 32 bits, and coordinates of layers are relative to their origin.
 inline std::vector<PointField> point_fields(const Cell& cell, std::vector<float>& xyz32) {
   std::vector<PointField> fields;
   std::size_t offset = 0;
@@ -124,7 +124,7 @@ void fill(Cloud& cloud, const Cell& cell) {
     cloud.fields.push_back(std::move(one));
     step += field.bytes;
   }
-  // x, y, z lie side by side there as here: they are copied as one
+  // x, y, z are adjacent in both, and are copied as one
   fields.erase(
       std::remove_if(fields.begin(), fields.end(), [](const auto& one) { return one.from == nullptr; }),
       fields.end());
@@ -138,7 +138,7 @@ void fill(Cloud& cloud, const Cell& cell) {
   cloud.is_bigendian = false;
   cloud.is_dense = true;
   cloud.data.resize(points * step);
-  constexpr std::size_t block = 1024;  // of points: they stay in the cache until all their fields are there
+  constexpr std::size_t block = 1024;  // points that stay in the cache until all their fields are written
   for (std::size_t first = 0; first < points; first += block)
     for (const auto& field : fields)
       spread(field, first, std::min(block, points - first), cloud.data.data(), step);
@@ -147,14 +147,14 @@ void fill(Cloud& cloud, const Cell& cell) {
 }  // namespace detail
 
 /// Make a `sensor_msgs/PointCloud2` (of any generator) of a cell's points: x, y, z first, as float32 in the map's
-/// frame, then every other column that has a type there (integers of 64 bits and floats of 16 have none), each beside
-/// the one before.  What the message had is replaced; its stamp stays.
+/// frame, then every other column with a type in ROS (64-bit integers and 16-bit floats have none), without gaps.
+/// The contents of the message are replaced; its stamp stays.
 ///
-/// Throws NoColumn where the layer's rows are no points, BadRequest where they are more than a message can have,
-/// SegmentError where the columns are damaged.
+/// Throws NoColumn if the layer's rows are not points, BadRequest if they exceed the size of a message,
+/// SegmentError if the columns are damaged.
 template <typename Cloud>
 void to_point_cloud2(const Cell& cell, Cloud& cloud) {
-  static_cast<void>(cell.named("xyz"));  // throws where there are none
+  static_cast<void>(cell.named("xyz"));  // throws if there is no such column
   cloud.fields.clear();
   detail::fill(cloud, cell);
   cloud.header.frame_id = cell.frame_id;

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The map's points near a place, where they lie in shared memory.
+// The map's points near a position, in place in shared memory.
 
 #ifndef SHMMAP_POINTS_AROUND_HPP
 #define SHMMAP_POINTS_AROUND_HPP
@@ -16,19 +16,19 @@ namespace shmmap {
 /// A cell of a window that touches a circle.
 struct NearCell {
   CellPtr cell;
-  bool whole = false;  ///< its box lies in the circle, and so do all its points
+  bool whole = false;  ///< its box, and so all its points, are within the circle
 };
 
-/// Cells that touch a circle, and which of their points lie in it; nothing is copied, and no point is looked at
-/// before `count` or `for_each`.
+/// Cells that touch a circle, and their points within it; nothing is copied, and no point is read before `count`
+/// or `for_each`.
 struct PointsAround {
   double x = 0.0, y = 0.0, radius = 0.0;
   std::vector<NearCell> cells;
-  /// Whether these are all cells that the map has there: see `Window::covers`.
+  /// Whether these are all cells of the map in the circle: see `Window::covers`.
   bool covered = false;
 
-  /// Call `take(cell, row)` for each point in the circle, its border included; of a cell that lies wholly in it
-  /// for all its points.  Throws NoColumn where the layer's rows are no points.
+  /// Call `take(cell, row)` for each point in the circle, including its border; all points of a cell
+  /// within the circle are taken.  Throws NoColumn if the layer's rows are not points.
   template <typename Take>
   void for_each(const Take& take) const {
     for (const auto& one : cells) {
@@ -38,7 +38,7 @@ struct PointsAround {
     }
   }
 
-  /// How many points lie in the circle.
+  /// Number of points in the circle.
   [[nodiscard]] std::size_t count() const {
     std::size_t found = 0;
     for_each([&found](const Cell&, std::size_t) { ++found; });

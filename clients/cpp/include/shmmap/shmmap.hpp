@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// shmmap's client: asks the daemon for cells of a point-cloud map, and maps what it hands out.
+// shmmap's client: requests cells of a point-cloud map from the daemon, and maps them.
 //
 //     shmmap::Client client;                                    // finds the daemon as every client does
 //     auto answer = client.area(shmmap::Square{x, y, 150.0});   // Autoware's area test, metres
@@ -9,16 +9,15 @@
 //       use(xyz.data(), xyz.rows());
 //     }
 //
-// Header-only, C++17, Linux, nothing but the C library.  What goes over the socket is in
-// shmmap/protocol/PROTOCOL.md, what is mapped in shmmap/segment/LAYOUT.md; where both are silent this does as
-// the Python client does.
+// Header-only, C++17, Linux, only the C library.  The messages are specified in shmmap/protocol/PROTOCOL.md, and the
+// segments in shmmap/segment/LAYOUT.md; where both are silent, this client acts like the Python client.
 //
 // A `Client` is one connection and one session: move it, do not share it among threads.  Cells may be used by
-// any thread, outlive their client and the daemon, and are unmapped with their last owner.  Nothing here starts
-// threads, handles signals or keeps globals.  Whatever is read is checked first; damaged bytes cost an
-// exception, no crash.
+// any thread, outlive their client and the daemon, and are unmapped with their last owner.  The library starts no
+// threads, handles no signals and has no globals.  All input is checked before use: damaged bytes cause an
+// exception, not a crash.
 //
-// One header for each concept, in the order in which they explain each other.
+// One header for each concept, in reading order.
 
 #ifndef SHMMAP_SHMMAP_HPP
 #define SHMMAP_SHMMAP_HPP

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// How the daemon is and what it keeps, read from its statistics segment without a request: so it also works while
-// the daemon is busy, stopped, hung or dead.  The bytes are in shmmap/statistics/STATISTICS.md.
+// State and contents of the daemon, read from its statistics segment without a request.  So this also works while
+// the daemon is busy, stopped, hung or dead.  The layout is in shmmap/statistics/STATISTICS.md.
 
 #ifndef SHMMAP_STATISTICS_HPP
 #define SHMMAP_STATISTICS_HPP
@@ -33,10 +33,10 @@
 
 namespace shmmap {
 
-/// How a daemon is: no segment, no process, stopped by a signal, no beat for 5 s, or well.
+/// State of a daemon: no segment, no process, stopped by a signal, no beat for 5 s, or well.
 enum class DaemonState { absent, dead, stopped, hung, healthy };
 
-/// One number of the daemon's: a counter only grows during its run, a gauge is a present amount.
+/// One number of the daemon: a counter only grows during its run, a gauge is a present amount.
 struct Counter {
   std::string name, unit, help;
   bool is_gauge = false;
@@ -49,7 +49,7 @@ struct Histogram {
   std::int64_t sum_ns = 0;
   std::vector<std::int64_t> counts;
 
-  /// The duration in seconds that this share of all does not exceed, right to an eighth; NaN when there is none.
+  /// The quantile of the durations for this share, seconds, accurate to an eighth; NaN without durations.
   [[nodiscard]] double quantile(double share) const {
     double total = 0.0, before = 0.0;
     for (const auto count : counts) total += static_cast<double>(count);
@@ -74,19 +74,19 @@ struct Histogram {
 
 /// One segment that the daemon keeps.
 struct KeptCell {
-  std::string id, layer, segment;  ///< too long ones are cut, and have an ellipsis there
+  std::string id, layer, segment;  ///< texts that are too long are cut with an ellipsis
   enum class State { resident = 1, stale, retired } state = State::resident;
   std::uint64_t version = 0, bytes = 0, points = 0, hits = 0;
   double min_x = 0.0, min_y = 0.0, max_x = 0.0, max_y = 0.0;
   std::int64_t last_use_monotonic_ns = 0, load_ns = 0;
-  bool ahead = false;  ///< fetched ahead, and not asked for yet
+  bool ahead = false;  ///< prefetched, and not requested yet
 };
 
 /// One client of the daemon.
 struct ListedClient {
   std::uint64_t session = 0, cells = 0, bytes = 0, requests = 0;
   std::uint32_t pid = 0;
-  std::int64_t uid = -1, gid = -1;  ///< -1: not known
+  std::int64_t uid = -1, gid = -1;  ///< -1: unknown
   std::string client, command;
   std::int64_t last_request_monotonic_ns = 0;
   std::optional<std::array<double, 2>> pose = std::nullopt;  ///< metres
@@ -100,7 +100,7 @@ struct KeptLiveMap {
                file_bytes = 0, scans = 0, durable = 0, budget_bytes = 0, damaged = 0, mappers = 0, change = 0;
 };
 
-/// All of it as of one moment.
+/// All statistics at one point in time.
 struct Statistics {
   DaemonState state = DaemonState::absent;
   double beat_age = 0.0;  ///< seconds since the daemon last wrote
@@ -111,7 +111,7 @@ struct Statistics {
   std::vector<ListedClient> clients;
   std::vector<KeptLiveMap> live_maps;
 
-  /// A counter's value by name; nothing if this daemon has none of that name.
+  /// A counter's value by name; nothing if this daemon has no such counter.
   [[nodiscard]] std::optional<std::int64_t> value(std::string_view name) const {
     for (const auto& one : counters)
       if (one.name == name) return one.value;
@@ -121,7 +121,7 @@ struct Statistics {
 
 namespace detail {
 
-/// What never changes in a statistics segment: where things lie, and what the numbers mean.
+/// The constant part of a statistics segment: offsets, and meanings of the numbers.
 struct StatisticsHeader {
   std::uint64_t identity = 0, identity_bytes = 0, state = 0, state_bytes = 0, table = 0, rows = 0, row_bytes = 0,
                 max_rows = 0;
@@ -135,11 +135,11 @@ struct StatisticsHeader {
   throw SegmentError("segment_corrupt", path + ": " + why);
 }
 
-/// An open file of the daemon's, read without mapping it.
+/// An open file of the daemon, read without mapping it.
 class StatisticsFile {
  public:
   StatisticsFile() = default;
-  /// Throws SegmentError; `is_there` is false where there is no such file.
+  /// Throws SegmentError; `is_there` is false if there is no such file.
   explicit StatisticsFile(std::string path) : path_(std::move(path)) {
     fd_ = Descriptor(::open(path_.c_str(), O_RDONLY | O_CLOEXEC | O_NOFOLLOW | O_NONBLOCK));  // NOLINT
     if (fd_.get() < 0) {
@@ -154,7 +154,7 @@ class StatisticsFile {
   [[nodiscard]] int fd() const noexcept { return fd_.get(); }
   [[nodiscard]] std::uint64_t size() const noexcept { return size_; }
   [[nodiscard]] const std::string& path() const noexcept { return path_; }
-  /// These bytes, all of them.
+  /// A range of bytes, completely.
   [[nodiscard]] std::string bytes(std::uint64_t at, std::uint64_t count) const {
     if (at > size_ || count > size_ - at) damaged(path_, "its tables lie outside of it");
     std::string found(count, '\0');
@@ -209,17 +209,17 @@ inline StatisticsHeader read_statistics_header(const StatisticsFile& file) {
 
 }  // namespace detail
 
-/// Reads an instance's statistics as often as it is asked; the daemon need not run yet.
+/// Reader of an instance's statistics; the daemon need not run yet.
 class StatisticsReader {
  public:
   explicit StatisticsReader(const std::string& instance = "default", const std::string& shm_dir = "/dev/shm")
       : path_(shm_dir + "/shmmap." + instance + ".statistics") {}
 
-  /// The statistics as they are now; without `tables` cells, clients and live maps are left out.
+  /// The present statistics; without `tables` cells, clients and live maps are left out.
   /// Throws SegmentError: `not_permitted`, `segment_corrupt`.
   Statistics snapshot(bool tables = true) {
     struct stat status {};
-    if (!file_.is_there() || ::fstat(file_.fd(), &status) != 0 || status.st_nlink == 0) {  // another one since
+    if (!file_.is_there() || ::fstat(file_.fd(), &status) != 0 || status.st_nlink == 0) {  // replaced by another file
       header_.reset();
       file_ = detail::StatisticsFile(path_);
     }
@@ -247,7 +247,7 @@ class StatisticsReader {
     return detail::read_at<T>(detail::raw(text), offset);
   }
 
-  /// The newer one of two blocks of which one is always whole.
+  /// The newer of two blocks, at least one of which is always complete.
   template <typename IsWhole>
   std::string newest(std::uint64_t offset, std::uint64_t size, const IsWhole& is_whole) const {
     for (int left = attempts; left > 0; --left) {
@@ -318,7 +318,7 @@ class StatisticsReader {
     return {at<std::uint32_t>(state, 24), at<std::uint32_t>(state, counters + 8)};
   }
 
-  /// How the daemon is, by the process that wrote this and by its last beat.
+  /// State of the daemon, by the process that wrote the segment and by its last beat.
   static DaemonState judged(const Statistics& found) {
     const auto by_beat = found.beat_age <= hung_after_s ? DaemonState::healthy : DaemonState::hung;
     const auto text = [&found](const char* name) {
@@ -334,7 +334,7 @@ class StatisticsReader {
     const auto got = fd.get() >= 0 ? ::read(fd.get(), line.data(), line.size()) : -1;
     if (got <= 0) {
       const bool is_gone = ::kill(static_cast<pid_t>(std::atol(pid.c_str())), 0) != 0 && errno == ESRCH;
-      return is_gone ? DaemonState::dead : by_beat;  // others' processes may be hidden
+      return is_gone ? DaemonState::dead : by_beat;  // processes of other users may be hidden
     }
     const std::string_view whole(line.data(), static_cast<std::size_t>(got));
     auto fields = whole.substr(std::min(whole.rfind(')') + 2, whole.size()));
@@ -346,7 +346,7 @@ class StatisticsReader {
     return letter == 'T' || letter == 't' ? DaemonState::stopped : by_beat;
   }
 
-  /// Up to `count` rows of a table, decoded; those that are free, being changed, or damaged are left out.
+  /// Up to `count` rows of a table, decoded, without rows that are free, being changed, or damaged.
   template <typename Read>
   void each_row(std::uint64_t offset, std::uint64_t count, std::uint64_t row_bytes, const Read& read) const {
     if (offset == 0 || row_bytes < 8 || offset > file_.size()) return;
@@ -367,7 +367,7 @@ class StatisticsReader {
   }
 
   void read_cells(Statistics& found, std::uint64_t used) const {
-    for (int left = table_attempts; left > 0; --left) {  // as of one moment, if the daemon lets us
+    for (int left = table_attempts; left > 0; --left) {  // a consistent state, if the daemon permits
       const auto before = at<std::uint64_t>(file_.bytes(header_->table, 8), 0);
       found.cells.clear();
       each_row(header_->rows, std::min(used, header_->max_rows), header_->row_bytes, [&found](detail::Row& row) {
@@ -420,7 +420,7 @@ class StatisticsReader {
       for (auto* value : {&one.chunks, &one.active, &one.bytes, &one.loading, &one.dirty, &one.saving,
                           &one.waiting_bytes, &one.files, &one.file_bytes, &one.scans, &one.durable, &one.budget_bytes})
         *value = row.get().integer();
-      row.get().skip(1);  // names of what is damaged, and of mappers
+      row.get().skip(1);  // names of damaged files, and of mappers
       row.get().skip(1);
       one.problem = row.get().text();
       one.change = row.get().integer();

@@ -5,11 +5,11 @@
 //     shmmap::Window window(shmmap::Options{}, {150.0, {"points"}});
 //     while (driving) {
 //       try {
-//         const auto update = window.move_to({x, y});                    // 0.02 s at most
+//         const auto update = window.move_to({x, y});                    // takes at most 0.02 s
 //         for (const auto& id : update.removed) drop(id);                // removals first
 //         for (const auto& cell : update.added) add(cell->id, cell->column<float>("xyz"));
 //         for (const auto& cell : update.changed) replace(cell->id, cell->column<float>("xyz"));
-//       } catch (const shmmap::Unreachable&) {}                          // the window keeps what it has
+//       } catch (const shmmap::Unreachable&) {}                          // the window keeps its cells
 //     }
 
 #ifndef SHMMAP_WINDOW_HPP
@@ -46,7 +46,7 @@ struct RetentionCandidate {
 /// Decides for each departed cell whether to keep it attached.
 using RetentionPolicy = std::function<std::vector<bool>(const std::vector<RetentionCandidate>&)>;
 
-/// Keeps cells up to a distance, a sum of bytes and an age, the nearest first; the default keeps nothing.
+/// Keeps departed cells up to a distance, a sum of bytes and an age, nearest first; the default keeps nothing.
 struct Retention {
   double distance = 0.0;
   double max_bytes = std::numeric_limits<double>::infinity();
@@ -66,7 +66,7 @@ struct Retention {
       if (distance == 0.0 || cell.distance > distance) break;
       if (cell.age > max_age) continue;
       left -= static_cast<double>(cell.nbytes);
-      if (left < 0.0) break;  // a nearer cell is never dropped for the sake of a farther one
+      if (left < 0.0) break;  // never drop a nearer cell in favour of a farther one
       kept[index] = true;
     }
     return kept;
@@ -77,33 +77,33 @@ enum class Shape { circle, square };
 
 struct WindowOptions {
   double radius = 150.0;                         ///< metres around the pose
-  std::vector<std::string> layers = {"points"};  ///< what to have of each cell
+  std::vector<std::string> layers = {"points"};  ///< layers of each cell
   Shape shape = Shape::circle;                   ///< `square`: Autoware's area test
-  double update_distance = 20.0;   ///< metres that the pose moves before the daemon is asked again
-  double refresh_interval = 1.0;   ///< seconds after which it is asked anyhow: for a changed map, with the present route
+  double update_distance = 20.0;   ///< metres that the pose moves before the next request
+  double refresh_interval = 1.0;   ///< seconds until a request in any case: to notice map changes, and send the route
   std::optional<ZRange> z = std::nullopt;  ///< heights of interest
-  RetentionPolicy retention = Retention{};  ///< what to keep attached of what has left the window
+  RetentionPolicy retention = Retention{};  ///< which departed cells to keep attached
 };
 
-/// What happened to a window since the last `Window::move_to`.
+/// Changes of a window since the last `Window::move_to`.
 struct WindowUpdate {
   std::vector<CellPtr> added, kept;
-  std::vector<CellPtr> changed;      ///< the new ones, in place of older versions
+  std::vector<CellPtr> changed;      ///< new versions, which replace older ones
   std::vector<std::string> removed;  ///< ids that left the window in any layer
   std::vector<std::pair<std::string, std::string>> pending;
   std::vector<Failure> failed;
-  bool current = false;  ///< the window answers the pose just given
-  bool covered = true;   ///< the daemon knows all that the map has in the window
+  bool current = false;  ///< the window is up to date for the given pose
+  bool covered = true;   ///< the daemon knows all cells of the map in the window
 
-  /// Whether the set of cells is another one than before.
+  /// Whether the set of cells has changed.
   [[nodiscard]] bool any() const { return !added.empty() || !changed.empty() || !removed.empty(); }
-  /// Whether nothing in it is missing.
+  /// Whether no cell is missing.
   [[nodiscard]] bool complete() const { return current && covered && pending.empty() && failed.empty(); }
 };
 
 namespace detail {
 
-/// A reply that is being taken over: its cells are mapped as time allows.
+/// A reply in processing, whose cells are mapped as time allows.
 struct Arriving {
   Cells reply;
   std::vector<CellPtr> places;
@@ -111,25 +111,24 @@ struct Arriving {
   std::size_t next = 0;
 };
 
-/// What a window has asked for.
+/// A request of a window.
 struct Question {
   Intent pose;
   Area area;
   Clock::time_point asked;
-  bool by_name = false;  // what is held, as it has to be after a daemon's restart
+  bool by_name = false;  // held cells are sent by id, as is necessary after a daemon's restart
 };
 
 }  // namespace detail
 
-/// The cells around a moving pose.  Everything happens in `move_to`, in the thread that calls it, and takes no longer
-/// than the call may: what has not come by then stays on its way, and is taken over by the next call.  So it can be
-/// called in a control loop.
+/// The cells around a moving pose.  All work is done in `move_to`, in the caller's thread, within the time limit of
+/// the call; the next call processes replies that arrive later.  So it can be called in a control loop.
 ///
-/// The daemon fetches what the window will ask for next: along the route of the pose, without one straight ahead and
-/// to both sides of that.  A radius larger than what is needed brings nothing.
+/// The daemon prefetches the cells that the window will request next: along the route of the pose, or without one
+/// straight ahead and to both sides.  A radius larger than necessary has no benefit.
 ///
-/// A daemon that fails costs an exception there, and the window keeps what it has; a restarted one is found again
-/// by itself, and nothing that has not changed is mapped again.
+/// If the daemon fails, `move_to` throws, and the window keeps its cells.  It reconnects to a restarted daemon by
+/// itself, and does not map unchanged cells again.
 class Window {
  public:
   using Clock = detail::Clock;
@@ -137,11 +136,11 @@ class Window {
 
   static constexpr double default_wait = 0.02;
 
-  /// A window that connects in `move_to`.  Throws BadRequest where an option makes no sense.
+  /// A window that connects in `move_to`.  Throws BadRequest if an option is invalid.
   explicit Window(Options client, WindowOptions options = {})
       : Window(Client(std::move(client), nullptr), std::move(options)) {}
 
-  /// The same, through a client that is connected.
+  /// The same, with a connected client.
   explicit Window(Client client, WindowOptions options = {})
       : client_(std::move(client)), options_(std::move(options)) {
     detail::check_circle(0.0, 0.0, options_.radius);
@@ -152,12 +151,12 @@ class Window {
       throw BadRequest("bad_request", "a window's lowest z lies above its highest");
   }
 
-  /// Give the window the pose, and what has come for it; returns what has changed since the last call.
+  /// Set the pose, and process received replies; returns the changes since the last call.
   ///
-  /// Waits until nothing is missing, at most `wait` seconds, and no longer than half a second where what is missing
-  /// does not fit in the daemon's memory, or cannot be reached.  Throws BadRequest, and whatever keeps the daemon from
-  /// being asked: Unreachable at once where no daemon listens and `wait` is below 20 ms, else when that time is over, and
-  /// `no_answer` where it has been silent for `Options::timeout` seconds.  The window keeps what it has.
+  /// Waits until no cell is missing, at most `wait` seconds, and at most half a second for cells that do not fit into
+  /// the daemon's memory, or cannot be reached.  Throws BadRequest, and errors of the connection: Unreachable if no
+  /// daemon listens (at once if `wait` is below 20 ms, else after `wait`), and `no_answer` if the daemon has been
+  /// silent for `Options::timeout` seconds.  The window keeps its cells.
   WindowUpdate move_to(const Intent& pose, double wait = default_wait) {
     check_pose(pose);
     if (!(wait >= 0.0)) throw BadRequest("bad_request", "wait must not be below zero");
@@ -166,9 +165,9 @@ class Window {
     return changes_since_last();
   }
 
-  /// Wait until nothing is missing around a pose, for a program's start; the next `move_to` returns what has come.
-  /// Returns whether it is so: false when `seconds` are over, also without a daemon, and at once when all that is
-  /// missing has failed.
+  /// Wait until no cell is missing around a pose, for a program's start; the next `move_to` returns the new cells.
+  /// Returns whether the window is complete: false after `seconds`, also without a daemon, and at once if all missing
+  /// cells have failed.
   bool wait_until_complete(const Intent& pose, double seconds) {
     check_pose(pose);
     pose_ = pose;
@@ -183,7 +182,7 @@ class Window {
       try {
         become_current(until, std::numeric_limits<double>::infinity());
         return complete();
-      } catch (const Unreachable&) {  // `error()` says why
+      } catch (const Unreachable&) {  // `error()` has the reason
         if (Clock::now() + Client::look_again >= until) return complete();
       }
     }
@@ -196,18 +195,18 @@ class Window {
     return found;
   }
 
-  /// Version of each (id, layer) in the window: remembering them keeps nothing mapped.
+  /// Version of each (id, layer) in the window; storing these keeps no cell mapped.
   [[nodiscard]] std::map<LayerKey, std::uint64_t> versions() const {
     std::map<LayerKey, std::uint64_t> found;
     for (const auto& [key, cell] : cells_) found.emplace(key, cell->version);
     return found;
   }
 
-  /// Whether the window answers the last pose, and nothing in it is pending, failed or not known yet.
+  /// Whether the window is up to date for the last pose, with no cell pending, failed or unknown.
   [[nodiscard]] bool complete() const { return answers() && covered_ && pending_.empty() && failed_.empty(); }
 
-  /// Whether all that the map has within a circle is in the window, in all its layers (in `layer`, if one is given).
-  /// False where the circle reaches beyond what was last answered, or touches a cell that is missing.
+  /// Whether the window has all cells of the map within a circle, in all its layers (or in `layer`, if given).  False
+  /// if the circle reaches beyond the last answered area, or touches a missing cell.
   [[nodiscard]] bool covers(double x, double y, double radius = 0.0, std::string_view layer = {}) const {
     detail::check_circle(x, y, radius);
     if (!area_ || !covered_ || !detail::contains_circle(*area_, x, y, radius)) return false;
@@ -222,8 +221,8 @@ class Window {
                        [&](const auto& one) { return holds(one.id, one.layer) || lies_apart(one.box); });
   }
 
-  /// The window's cells that touch a circle, where they lie in memory.  `layer`: as it was asked for, or as cells
-  /// have it; empty: the first one.  Throws BadRequest where the window has no such layer.
+  /// The window's cells that touch a circle, in place in memory.  `layer`: its name in the request or in cells;
+  /// empty: the first layer.  Throws BadRequest if the window has no such layer.
   [[nodiscard]] PointsAround points_around(double x, double y, double radius, std::string_view layer = {}) const {
     detail::check_circle(x, y, radius);
     const std::string name = canonical(layer.empty() ? std::string_view(options_.layers.front()) : layer);
@@ -236,7 +235,7 @@ class Window {
     return found;
   }
 
-  /// Why the daemon cannot be asked, or could not the last time; nothing if it could.
+  /// Error of the present or last request to the daemon; nothing if it succeeded.
   [[nodiscard]] std::optional<Error> error() const {
     if (error_ || client_.is_connected()) return error_;
     if (client_.epoch() == 0)
@@ -244,15 +243,15 @@ class Window {
     return Error("connection_lost", client_.path() + ": the daemon ended, or was restarted",
                  "the window serves what it has, and connects again by itself");
   }
-  /// Since when; a daemon that ends is noticed when this or `error` is asked, one that hangs when a reply is overdue.
+  /// Time of that error.  A daemon's end is noticed by calls of this or `error`, a hang when a reply is overdue.
   [[nodiscard]] std::optional<Clock::time_point> stale_since() {
     if (!stale_since_ && !client_.is_connected()) stale_since_ = Clock::now();
     return stale_since_;
   }
 
-  /// State of the map that the window shows.
+  /// Version of the map in the window.
   [[nodiscard]] std::uint64_t map_version() const noexcept { return map_version_; }
-  /// The client that the window asks through; the window's thread may ask other things through it.
+  /// The client of the window; the window's thread may use it for other requests.
   Client& client() noexcept { return client_; }
 
  private:
@@ -276,7 +275,7 @@ class Window {
 
   // --- when to ask ---
 
-  /// Whether what is here answers the last pose.
+  /// Whether the window is up to date for the last pose.
   [[nodiscard]] bool answers() const { return pose_ && !has_moved(*pose_); }
 
   [[nodiscard]] bool has_moved(const Intent& pose) const {
@@ -286,19 +285,19 @@ class Window {
            (distance >= options_.update_distance || !detail::contains_circle(*area_, pose.x, pose.y, 0.0));
   }
 
-  /// Whether asking again at once cannot bring more.
+  /// Whether an immediate further request would be useless.
   [[nodiscard]] bool is_settled() const {
     return asked_ && covered_ && pending_.empty() && std::none_of(failed_.begin(), failed_.end(), [](const auto& one) {
              return one.code == "over_budget" || one.code == "no_space" || one.code == "offline";
            });
   }
 
-  /// Whether the daemon should be asked again although nothing is missing: the pose has moved, or time has passed.
+  /// Whether to send a request although no cell is missing: the pose has moved, or time has passed.
   [[nodiscard]] bool is_due(Clock::time_point now) const {
     return has_moved(*pose_) || error_ || seconds(now - asked_at_) >= options_.refresh_interval;
   }
 
-  /// Ask until nothing is missing, nothing more has come for `stalled` seconds, or time is up.
+  /// Send requests until no cell is missing, nothing new has arrived for `stalled` seconds, or time is up.
   void become_current(Clock::time_point until, double stalled) {
     auto progressed = Clock::now();
     while (true) {
@@ -321,10 +320,10 @@ class Window {
           if (made_progress_ || !pending_.empty()) progressed = Clock::now();
         }
       } catch (const Error& error) {
-        error_ = error;  // NOLINT(cppcoreguidelines-slicing): its code says what it was
+        error_ = error;  // NOLINT(cppcoreguidelines-slicing): its code identifies it
         if (!stale_since_) stale_since_ = Clock::now();
         if (dynamic_cast<const Unreachable*>(&error) == nullptr) not_before_ = Client::after(0.1);
-        pause_until = Clock::now() + Client::look_again;  // it does not announce when it listens
+        pause_until = Clock::now() + Client::look_again;  // a starting daemon sends no notification
         if (not_before_ > pause_until || error.code() == "no_permission" || error.code() == "no_answer" ||
             pause_until >= until)
           throw;
@@ -340,7 +339,7 @@ class Window {
 
   [[nodiscard]] bool is_under_way() const { return arriving_ || client_.exchange_; }
 
-  /// Begin to ask for what the area around the pose has, and is not here.
+  /// Begin a request for the missing cells of the area around the pose.
   void ask(std::optional<double> wait, bool by_name) {
     client_.report_unmapped();
     question_ = detail::Question{*pose_, area_around(*pose_), Clock::now(), by_name};
@@ -352,7 +351,7 @@ class Window {
     client_.begin(number, message.data(), "cells", wait.value_or(0.0));
   }
 
-  /// Take over what has come; returns whether nothing more of it is to come.
+  /// Process the received reply; returns whether it is complete.
   bool take_over(Clock::time_point until) {
     if (!arriving_) {
       std::string reply;
@@ -371,7 +370,7 @@ class Window {
     return true;
   }
 
-  /// Map the cells of the reply, one at least; returns whether all are.
+  /// Map cells of the reply, at least one; returns whether all are mapped.
   bool map(Clock::time_point until) {
     auto& [reply, places, gone, next] = *arriving_;
     while (next < places.size()) {
@@ -382,12 +381,12 @@ class Window {
     return true;
   }
 
-  /// Take over a reply whose cells are mapped.
+  /// Apply a reply whose cells are mapped.
   void finish() {
     Answer answer = std::move(arriving_->reply.answer);
     for (auto& cell : arriving_->places)
       if (cell) answer.cells.push_back(std::move(cell));
-    for (const auto at : arriving_->gone) {  // evicted in this moment: they come with the next reply
+    for (const auto at : arriving_->gone) {  // just evicted: the next reply has them
       const auto& handle = arriving_->reply.handles[at];
       answer.pending.emplace_back(client_.whole(handle.id), handle.layer);
     }
@@ -398,8 +397,8 @@ class Window {
     error_.reset();
     stale_since_.reset();
     if (answer.epoch != epoch_ && !cells_.empty() && !question_.by_name) {
-      // A daemon that was restarted cannot know what versions of an earlier run belonged to, and takes those that are
-      // not current for unknown ones.  What was mapped stays so while it is asked again.
+      // A restarted daemon cannot resolve versions of an earlier run, and treats those that are not current as
+      // unknown.  Mapped cells stay mapped during the next request.
       earlier_ = std::move(answer.cells);
       ask(std::nullopt, true);
       made_progress_ = true;
@@ -409,7 +408,7 @@ class Window {
     if (answer.map_version != map_version_ || std::any_of(answer.failed.begin(), answer.failed.end(), [](const auto& one) {
           return one.code == "over_budget";
         }))
-      retained_.clear();  // it may be outdated, or in the way of what is in the window
+      retained_.clear();  // they may be outdated, or conflict with cells in the window
     made_progress_ = apply(answer, now);
     asked_ = question_.pose, area_ = question_.area, asked_at_ = question_.asked;
     epoch_ = answer.epoch, map_version_ = answer.map_version, covered_ = answer.covered;
@@ -442,12 +441,12 @@ class Window {
     return found;
   }
 
-  /// Take over what came; returns whether anything did.
+  /// Apply the new cells; returns whether there were any.
   bool apply(const Answer& answer, Clock::time_point now) {
     std::set<std::string> removed(answer.removed.begin(), answer.removed.end());
     const std::set<std::uint64_t> versions(answer.removed_versions.begin(), answer.removed_versions.end());
     if (!versions.empty()) {
-      // of a cell in several layers all have to go: of a single one that the daemon has forgotten, another comes
+      // remove all layers of a cell; if the daemon has forgotten only one of them, it sends that one again
       std::map<std::string, bool> is_gone;
       for (const auto& [key, cell] : cells_) {
         auto& gone = is_gone.emplace(key.first, true).first->second;
@@ -506,7 +505,7 @@ class Window {
     return update;
   }
 
-  /// The name by which cells have a layer that was asked for.
+  /// The name of a requested layer in cells.
   [[nodiscard]] std::string canonical(std::string_view layer) const {
     if (std::find(canonical_.begin(), canonical_.end(), layer) != canonical_.end()) return std::string(layer);
     for (std::size_t at = 0; at < options_.layers.size(); ++at)
@@ -520,7 +519,7 @@ class Window {
   detail::Question question_;
   bool made_progress_ = false;   // with the last reply
   bool were_gone_ = false;       // segments of the last reply
-  std::vector<CellPtr> earlier_;  // of a reply that is asked for again
+  std::vector<CellPtr> earlier_;  // cells of a reply that is requested again
   std::map<LayerKey, CellPtr> cells_;
   std::map<LayerKey, Kept> retained_;
   std::map<LayerKey, std::uint64_t> seen_;
@@ -531,7 +530,7 @@ class Window {
   std::optional<Area> area_;
   std::optional<Error> error_;
   std::optional<Clock::time_point> stale_since_;
-  Clock::time_point asked_at_{}, not_before_{};  // when it was asked for the last time; when it may be again
+  Clock::time_point asked_at_{}, not_before_{};  // time of the last request; earliest time of the next
   double pause_s_ = 0.0;
   std::uint64_t epoch_ = 0, map_version_ = 0;
   bool covered_ = true;

@@ -7,14 +7,14 @@ wrong ones at other leaf sizes.  True covariances (``coarse_fine``) fit more clo
 2 m: the share falls to 0.41 at 1 m.
 
 A score measures how well points fit at a pose.  A single point, a stretch of road, or points within a few
-metres fit at many poses; limits on `Evidence` exclude such results.  The Hessian of the score is the
-information about the pose, up to a factor.  ``sharpness`` is the least curvature of the score when the scan
-is translated in any direction.  ``spread`` compares directions, with turns left free: the covariance of the
-position is the translational block of the inverse Hessian (the Schur complement of the rotations).  How
-round it is depends neither on the number of points nor on units.  Degeneracy by the smallest eigenvalue:
-Zhang, Kaess and Singh, "On degeneracy of optimization-based state estimation problems", ICRA 2016;
-translations and rotations by themselves, for metres and radians do not compare: Tuna et al., "X-ICP", IEEE
-T-RO 2024.
+metres fit at many poses; limits on `Evidence` exclude such results.  The Hessian of the score is
+the information about the pose, up to a factor.  ``sharpness`` is the least curvature of the score when the
+scan is translated in any direction.  ``spread`` compares directions, with rotations left free.  The
+covariance of the position is the translational block of the inverse Hessian (the Schur complement of the
+rotations); the ratio of its eigenvalues depends neither on the number of points nor on units.  Degeneracy by
+the smallest eigenvalue: Zhang, Kaess and Singh, "On degeneracy of optimization-based state estimation
+problems", ICRA 2016; translations and rotations separately, since metres and radians are not comparable:
+Tuna et al., "X-ICP", IEEE T-RO 2024.
 
 The limits were chosen on parts of recorded and simulated scans; ``python -m tests.benchmarks.ndt_trust``
 measures how well they separate right poses from wrong ones.

@@ -13,7 +13,7 @@
 
 namespace shmmap::detail {
 
-/// Where a handle says that a segment is.
+/// Location of a segment, from its handle.
 struct Handle {
   std::string id, layer, segment;
   std::uint64_t version = 0, offset = 0, bytes = 0;
@@ -31,7 +31,7 @@ inline std::string text_in(const unsigned char* header, std::uint64_t end, std::
   return std::string(reinterpret_cast<const char*>(header) + offset, size);
 }
 
-/// Read the table of columns; each is checked against what the segment has.
+/// Read the table of columns; each column is checked against the size of the segment.
 inline void read_columns(Cell& cell, const Handle& handle, const unsigned char* segment, std::uint64_t header_bytes,
                          std::uint64_t total) {
   const std::uint64_t end = header_bytes - 72;

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// MessagePack: how messages are written, and read without trust.
+// MessagePack: writing messages, and reading untrusted ones.
 
 #ifndef SHMMAP_DETAIL_MESSAGE_PACK_HPP
 #define SHMMAP_DETAIL_MESSAGE_PACK_HPP
@@ -59,12 +59,12 @@ class Writer {
 
 using Value = std::variant<std::uint64_t, double, bool, std::string>;
 
-/// Reads one message; whatever does not fit is a ProtocolMismatch.
+/// Reads one message; throws ProtocolMismatch for unexpected contents.
 class Reader {
  public:
   explicit Reader(std::string_view data) : data_(data) {}
 
-  /// Elements of an array, which follow.
+  /// Number of the elements of an array, which follow.
   std::uint64_t array() {
     const unsigned tag = byte();
     if ((tag & 0xf0U) == 0x90) return tag & 0x0fU;
@@ -91,14 +91,14 @@ class Reader {
     const unsigned tag = byte();
     if (tag < 0x80) return tag;
     if (tag >= 0xcc && tag <= 0xcf) return big_endian(1U << (tag - 0xcc));
-    if (tag >= 0xd0 && tag <= 0xd3) {  // of a signed kind, but not below zero
+    if (tag >= 0xd0 && tag <= 0xd3) {  // a signed type, but not negative
       const unsigned bytes = 1U << (tag - 0xd0);
       const std::uint64_t value = big_endian(bytes);
       if ((value >> (8 * bytes - 1)) == 0) return value;
     }
     bad("a number that is not below zero");
   }
-  /// A number that may be below zero.
+  /// A number that may be negative.
   std::int64_t integer() {
     const unsigned tag = peek();
     if (tag >= 0xe0) return static_cast<std::int8_t>(byte());
@@ -122,7 +122,7 @@ class Reader {
     if (tag >= 0xe0 || (tag >= 0xd0 && tag <= 0xd3)) return static_cast<double>(integer());
     return static_cast<double>(number());
   }
-  /// Whether nothing stands here; then it is read.
+  /// Whether the next value is nil, which is then consumed.
   bool nil() {
     if (peek() != 0xc0) return false;
     byte();
@@ -133,7 +133,7 @@ class Reader {
     if (tag == 0xc2 || tag == 0xc3) return tag == 0xc3;
     bad("true or false");
   }
-  /// A number, a text, true or false; anything else is left out, and an empty text stands for it.
+  /// A number, a text, true or false; any other value is skipped, and returned as an empty text.
   Value value() {
     const unsigned tag = peek();
     if (tag == 0xc2 || tag == 0xc3) return boolean();
@@ -145,7 +145,7 @@ class Reader {
   }
   /// Skip `values` values of any kind.
   void skip(std::uint64_t values) {
-    for (; values > 0; --values) {  // nested ones are counted, not recursed into
+    for (; values > 0; --values) {  // nested values are counted, without recursion
       const unsigned tag = byte();
       if (tag < 0x80 || tag >= 0xe0 || tag == 0xc0 || tag == 0xc2 || tag == 0xc3) continue;
       if ((tag & 0xf0U) == 0x80) values = more(values, 2 * (tag & 0x0fU));
@@ -176,7 +176,7 @@ class Reader {
     throw ProtocolMismatch("protocol_mismatch", std::string("the daemon's message has not ") + wanted +
                                                     " where that should be");
   }
-  /// Each value takes a byte at least: a count beyond that is no count.
+  /// Each value takes at least a byte, so that a larger count is invalid.
   std::uint64_t more(std::uint64_t values, std::uint64_t nested) const {
     if (nested > data_.size() - at_) bad("as many values as it says");
     return values + nested;
@@ -205,17 +205,17 @@ class Reader {
   std::size_t at_ = 0;
 };
 
-/// Elements of one array in a message: those that a later version added are left out, missing ones have defaults.
+/// Elements of one array in a message: additional ones of a later version are skipped, missing ones have defaults.
 class Row {
  public:
   explicit Row(Reader& reader) : reader_(reader), left_(reader.array()) {}
   Row(const Row&) = delete;
   Row& operator=(const Row&) = delete;
   ~Row() = default;
-  /// Whether there is another one; what it is comes next from the reader.
+  /// Whether there is another element, which the reader returns next.
   bool next() { return left_ > 0 && left_-- > 0; }
   Reader& reader() { return reader_; }
-  /// The next one, which has no default.
+  /// The next element, which has no default.
   Reader& get() {
     if (!next()) throw ProtocolMismatch("protocol_mismatch", "the daemon's message is too short");
     return reader_;

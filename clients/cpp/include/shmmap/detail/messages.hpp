@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Messages to the daemon and from it: shmmap/protocol/PROTOCOL.md.
+// Messages to and from the daemon: shmmap/protocol/PROTOCOL.md.
 
 #ifndef SHMMAP_DETAIL_MESSAGES_HPP
 #define SHMMAP_DETAIL_MESSAGES_HPP
@@ -76,7 +76,7 @@ inline void write(Writer& to, const Held& held) {
 
 inline constexpr std::uint64_t protocol_major = 2, protocol_minor = 0;
 
-/// What the daemon says about itself.
+/// The daemon's properties in its welcome.
 struct Welcome {
   std::uint64_t minor = 0, epoch = 0, session = 0;
   std::string instance, shm_dir, id_prefix, segment_prefix, frame_id, events;
@@ -95,7 +95,7 @@ inline Welcome read_welcome(Row& row) {
   found.instance = row.get().text();
   found.epoch = row.get().number();
   found.session = row.get().number();
-  row.get().number();  // the map's version: each answer has it
+  row.get().number();  // the map's version, which each answer has
   row.get().skip(1);   // the map's path
   found.frame_id = row.get().text();
   found.shm_dir = row.get().text();
@@ -116,7 +116,7 @@ inline Handle read_handle(Reader& reader) {
   found.segment = row.get().text();
   found.offset = row.get().number();
   found.bytes = row.get().number();
-  row.get().number();  // rows: the segment has them
+  row.get().number();  // rows, which the segment has too
   for (double* side : {&found.min_x, &found.min_y, &found.max_x, &found.max_y}) *side = row.get().real();
   if (row.next()) found.stale = reader.boolean();
   row.end();
@@ -170,7 +170,7 @@ inline Cells read_cells(Reader& reader, Row& row) {
   return found;
 }
 
-/// Read one page of the map's list behind its versions; returns where the next one starts.
+/// Read one page of the map's list after its versions; returns the start of the next one.
 inline std::optional<std::uint64_t> read_page(Row& row, std::vector<MapCell>& cells) {
   Reader& reader = row.get();
   for (auto left = reader.array(); left > 0; --left) {

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Segments as they are mapped: shmmap/segment/LAYOUT.md.
+// Mapped segments: shmmap/segment/LAYOUT.md.
 
 #ifndef SHMMAP_DETAIL_SEGMENTS_HPP
 #define SHMMAP_DETAIL_SEGMENTS_HPP
@@ -39,7 +39,7 @@ inline std::uint32_t crc32(const unsigned char* data, std::size_t size) {
   return ~crc;
 }
 
-/// A mapped object; what it holds does not change while it is mapped.
+/// A mapped object, whose contents do not change while it is mapped.
 class Mapping {
  public:
   Mapping(int fd, std::size_t size) : data_(::mmap(nullptr, size, PROT_READ, MAP_SHARED, fd, 0)), size_(size) {
@@ -62,7 +62,7 @@ T read_at(const unsigned char* data, std::size_t at) {
   return value;
 }
 
-/// A text that ends with zero bytes, or with its place.
+/// A text in a fixed field, padded with zero bytes.
 inline std::string fixed_text(const unsigned char* data, std::size_t size) {
   const auto* text = reinterpret_cast<const char*>(data);
   return std::string(text, ::strnlen(text, size));

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// One connection: ZMTP 3.0 over a Unix socket, which needs no library.
+// One connection: ZMTP 3.0 over a Unix socket, without a library.
 
 #ifndef SHMMAP_DETAIL_SOCKET_HPP
 #define SHMMAP_DETAIL_SOCKET_HPP
@@ -54,13 +54,13 @@ inline std::string error_text(int number) { return std::generic_category().messa
 /// One connection that speaks ZMTP 3.0 with the NULL mechanism, as in PROTOCOL.md.
 class Socket {
  public:
-  static constexpr std::uint64_t max_bytes = std::uint64_t{1} << 30;  // of one message
-  static constexpr std::size_t read_bytes = std::size_t{1} << 16;      // at once, at least
-  static constexpr std::size_t keep_bytes = std::size_t{1} << 20;      // of room that is not needed just now
+  static constexpr std::uint64_t max_bytes = std::uint64_t{1} << 30;  // largest message
+  static constexpr std::size_t read_bytes = std::size_t{1} << 16;      // least size of a read
+  static constexpr std::size_t keep_bytes = std::size_t{1} << 20;      // largest unused buffer to keep
 
   Socket() = default;
 
-  /// Connect and send what comes first; throws Unreachable.
+  /// Connect and send the greeting; throws Unreachable.
   Socket(const std::string& path, std::string_view ready) : path_(path) {
     sockaddr_un address{};
     if (path.size() >= sizeof address.sun_path)
@@ -77,13 +77,13 @@ class Socket {
 
   [[nodiscard]] int fd() const noexcept { return fd_.get(); }
   [[nodiscard]] bool is_open() const noexcept { return fd_.get() >= 0; }
-  /// Whether the other end is still there, as far as the kernel knows.
+  /// Whether the peer is still connected, as far as the kernel knows.
   [[nodiscard]] bool stands() const noexcept {
     pollfd one{fd_.get(), POLLRDHUP, 0};
     return is_open() && ::poll(&one, 1, 0) == 0;
   }
 
-  /// Have a message sent.
+  /// Queue a message for sending.
   void send(std::string_view body) {
     if (body.size() < 256) {
       output_.append({'\0', static_cast<char>(static_cast<unsigned char>(body.size()))});
@@ -96,8 +96,8 @@ class Socket {
     write_some();
   }
 
-  /// The next message; false if there is none until then.  What has come by then is read in any case, and no more
-  /// than one read after it, however much comes.  Throws Unreachable when the connection is over.
+  /// The next message; false if none arrives by then.  Data that has arrived by then is always read, followed by at
+  /// most one further read.  Throws Unreachable if the connection has ended.
   bool receive(std::string& message, Clock::time_point until) {
     for (bool is_over = false;; is_over = Clock::now() >= until) {
       write_some();
@@ -141,7 +141,7 @@ class Socket {
     }
   }
 
-  /// Read what has come, behind what is not taken yet; nothing may have.
+  /// Read arrived data, if any, and append it to the data not taken yet.
   void read_some() {
     if (start_ == end_) {
       start_ = end_ = 0;
@@ -150,7 +150,7 @@ class Socket {
       input_.erase(0, start_);
       end_ -= std::exchange(start_, 0);
     }
-    const auto missing = wanted_ - std::min(wanted_, end_ - start_);  // as the frame says: memory comes as bytes do
+    const auto missing = wanted_ - std::min(wanted_, end_ - start_);  // of the frame; memory grows with received bytes
     const auto room = std::clamp<std::size_t>(missing, read_bytes, 16 * read_bytes);
     if (input_.size() < end_ + room) input_.resize(end_ + room);
     const auto got = ::recv(fd_.get(), &input_[end_], input_.size() - end_, 0);
@@ -159,7 +159,7 @@ class Socket {
     else if (errno != EAGAIN && errno != EINTR) lost("the connection is over: " + error_text(errno));
   }
 
-  /// Wait until there is something to be read or written; false when that time is over.
+  /// Wait until the socket is readable or writable; false on timeout.
   bool is_ready(Clock::time_point until) const {
     pollfd one{fd_.get(), static_cast<short>(POLLIN | (output_.empty() ? 0 : POLLOUT)), 0};
     while (true) {
@@ -173,7 +173,7 @@ class Socket {
     }
   }
 
-  /// Take the next frame out of what has come; `complete_` says whether it was a message, and not a command.
+  /// Take the next frame of the received data; `complete_` is whether it was a message, not a command.
   bool parse(std::string& message) {
     const auto input = std::string_view(input_).substr(start_, end_ - start_);
     complete_ = false;
@@ -211,14 +211,14 @@ class Socket {
   }
 
   std::string path_, input_, output_;
-  std::size_t start_ = 0, end_ = 0, wanted_ = 0;  // of `input_`: what is not taken; of its next frame
+  std::size_t start_ = 0, end_ = 0, wanted_ = 0;  // range of `input_` not taken yet; size of its next frame
   bool greeted_ = false, complete_ = false;
   Descriptor fd_;
 };
 
 inline constexpr std::string_view ready_of_dealer{
     "\x04\x1c\x05READY\x0bSocket-Type\0\0\0\x06" "DEALER", 30};
-inline constexpr std::string_view ready_of_subscriber{  // to everything
+inline constexpr std::string_view ready_of_subscriber{  // subscribes to everything
     "\x04\x19\x05READY\x0bSocket-Type\0\0\0\x03" "SUB" "\0\x01\x01", 30};
 
 }  // namespace shmmap::detail

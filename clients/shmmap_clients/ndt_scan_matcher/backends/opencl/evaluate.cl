@@ -2,15 +2,14 @@
 // Score, gradient and Hessian sums of a scan at many poses; OpenCL C 1.2.
 //
 // The same arithmetic as the compiled backend's kernel, in the same order: the points of a chunk in order,
-// their neighbours in the order of columns, cells and heights.  Nothing is added atomically: each chunk of
-// 128 points at each pose has a row of sums of its own, so that a repeat, and a pose among others, give the
-// same bits.
+// their neighbours in the order of columns, cells and heights.  Without atomic additions: each chunk of 128
+// points at each pose has its own row of sums, so that results are the same to the bit, in repeats and batches.
 //
 // Macros that the program is built with (opencl_backend.py):
 //   DOUBLE          1: double throughout; 0: float throughout
-//   IN_PLACE        1: tables and what they lead to are at addresses; 0: at offsets into the pool, a buffer
-//   SEARCH          1, 7 or 27: the places of the lattice that are looked at
-//   MOST            neighbours that a point may have; the nearest are taken
+//   IN_PLACE        1: tables and their arrays are at addresses; 0: at offsets into the pool, a buffer
+//   SEARCH          1, 7 or 27: number of lattice places to search
+//   MOST            largest number of neighbours of a point; the nearest are taken
 //   ITEM_PER_CHUNK  1: one work-item sums a chunk, for processors; 0: one work-item a point, for GPUs
 
 #if DOUBLE
@@ -26,7 +25,7 @@ typedef float real;
 #define SUMS 40
 #define USED 39
 #define SHIFT 3  // the directory has a place for each square of 8 x 8 columns
-#define PASS 13  // sums that lie in local memory at a time, for all points of a chunk
+#define PASS 13  // sums in local memory at a time, for all points of a chunk
 #define POSE 40  // numbers of a pose: the transform's three rows, then three derivatives of the rotation
 #define NEGLIGIBLE R(36.7)
 
@@ -61,12 +60,12 @@ typedef struct {
     __global const int *square_start;
     __global const int *square_cell;
     int lead_i, lead_j, squares;  // of the directory: columns before the box, squares in a row
-    int box_i, box_j, ni, nj;     // of all columns; the corner relative to the pose's own place
-    int ref_i, ref_j, ref_k;      // that place: coordinates are relative to it, where they are floats
+    int box_i, box_j, ni, nj;     // box of all columns; its corner is relative to the pose's lattice place
+    int ref_i, ref_j, ref_k;      // lattice place of the pose, to which float coordinates are relative
     real leaf, inverse_leaf, radius2, d1, d2;
 } Map;
 
-// What a point's neighbours give: score, best share, sum of w q, sum of w (C - d2 q q^T).
+// Sums over a point's neighbours: score, best share, sum of w q, sum of w (C - d2 q q^T).
 typedef struct {
     real score, best, g0, g1, g2, h00, h01, h02, h11, h12, h22;
 } Share;
@@ -97,8 +96,8 @@ static inline void add_share(__global const real *C, real dx, real dy, real dz, 
 }
 
 // Visit a point's neighbours in order and return how many there are.
-// sum: gets the shares of those up to (*far, *rank); null: find the one that follows (*far, *rank) by distance,
-// and among equals by order, and put its distance and rank there.
+// sum: receives the terms of neighbours up to (*far, *rank).  If null: find the neighbour after (*far, *rank) by
+// distance, then by order, and write its distance and rank there.
 static inline int visit(const Map map, real px, real py, real pz, int i, int j, int k, real *far, int *rank,
                         Share *sum) {
     __global const uchar *pool = map.pool;
@@ -134,7 +133,7 @@ static inline int visit(const Map map, real px, real py, real pz, int i, int j, 
             const real y = py - map.origins[cell * 3 + 1];
             const real z = pz - map.origins[cell * 3 + 2];
 #else
-            // the cell's corner: few enough steps of the lattice from the pose's place to be exact
+            // the cell's corner, near enough to the pose's lattice place to be exact
             const real x = px - ((int)row[I0] - map.ref_i) * map.leaf;
             const real y = py - ((int)row[J0] - map.ref_j) * map.leaf;
             const real z = pz - k0 * map.leaf;
@@ -144,7 +143,7 @@ static inline int visit(const Map map, real px, real py, real pz, int i, int j, 
                 if (voxel < 0 || voxel >= voxels)
                     continue;
                 __global const real *C = inverse + voxel * 6;
-                if (!(C[0] > R(0.0)))  // refused in this variant
+                if (!(C[0] > R(0.0)))  // the variant refuses this voxel
                     continue;
                 const real dx = x - mean[voxel * 3];
                 const real dy = y - mean[voxel * 3 + 1];
@@ -178,7 +177,7 @@ static inline bool point_sums(const Map map, __global const real *pose, real x, 
     const real fi = floor(px * map.inverse_leaf) - map.box_i;
     const real fj = floor(py * map.inverse_leaf) - map.box_j;
     const real fk = floor(pz * map.inverse_leaf);
-    // outside, or not a number; also keeps the conversions to integers defined
+    // outside the map or not a number; this test also keeps the conversions to integers defined
     if (!(fi >= -1 && fi <= map.ni && fj >= -1 && fj <= map.nj && fabs(fk) < R(1073741824.0)))
         return false;
     const int i = (int)fi, j = (int)fj, k = (int)fk;
@@ -190,7 +189,7 @@ static inline bool point_sums(const Map map, __global const real *pose, real x, 
         return false;
     const int used = min(count, MOST);
     if (count > MOST) {
-        // seldom: find the farthest that is still taken, one after the other, then add again
+        // seldom: find the farthest neighbour within the limit, step by step, then add again
         far = -1;
         rank = -1;
         for (int taken = 0; taken < MOST; taken++)
