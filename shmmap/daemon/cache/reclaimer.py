@@ -111,8 +111,11 @@ TICK_S: Final = 0.002
 RETIRED_INTERVAL_S: Final = 0.1
 """How often a segment that is still mapped is checked where the kernel does not report closes."""
 WATCHED_INTERVAL_S: Final = 5.0
-"""How often, at most, it is checked where the kernel does: a precaution.  A report arrives a moment before
-the close takes effect, so the first checks after a report follow each other quickly."""
+"""Shortest interval of checks where the kernel reports the end of use: a precaution.
+
+A report arrives a moment before the close takes effect, so the first checks after a report follow each other
+quickly.
+"""
 SHARE_S: Final = 0.0005
 """Minimum time between two checks when very many segments are mapped (a check takes 15 us)."""
 HAND_OUT_GRACE_S: Final = 1.0

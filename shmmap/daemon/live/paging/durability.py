@@ -151,7 +151,7 @@ class Durability:
             chunk.unsaved.append((chunk.version, scan))
 
     def missing(self, chunks: Iterable[Chunk]) -> list[tuple[Chunk, int]]:
-        """Return those of these chunks, and of the evicted ones, that are not durable, with their versions.
+        """Return the chunks, of these and of the evicted ones, that are not durable yet, with their versions.
 
         Each is durable once its ``durable`` reaches the returned version.
         """
