@@ -45,6 +45,8 @@ HELD_PER_CELL: Final = 2
 """Bytes of packed versions, and cells held by name, that count as one cell of a waiting request's memory."""
 MAX_HOLDERS: Final = 16
 """Holders named beside each cell that does not fit: those with the most memory."""
+NOTED_PER_STEP: Final = 256
+"""Cells handed out that are noted between two looks at the time."""
 PROMISED: Final = 1e9
 """Priority of a load promised by a "pending" alone: after the distances of all requested cells."""
 
@@ -492,19 +494,17 @@ class CellRequests:
         session.connection.reply(reply)
 
     def _hand_out(self, session: Session, answer: _Answer, pace: Pace) -> Iterator[None]:
-        """Record the segments that a session was given."""
-        self._statistics.add("handles_sent", len(answer.residents))
-        is_large = len(answer.residents) > LARGE
-        if is_large:
-            yield
-            pace.begin()
-        for residents in batched(answer.residents):
+        """Note what a session was given; the first cells at once, before the client can have left."""
+        residents = answer.residents
+        self._statistics.add("handles_sent", len(residents))
+        for begin in range(0, len(residents), NOTED_PER_STEP):
+            some = residents[begin : begin + NOTED_PER_STEP]
+            self._cache.hand_out(some, self._now_s())
+            session.hold(some)
             yield from pace.pause()
             if not session.is_connected:
                 return
-            self._cache.hand_out(residents, self._now_s())
-            session.hold(residents)
-        if is_large:  # freeing the lists takes time, too
+        if len(residents) > LARGE:  # freeing what it took takes time, too
             yield
 
     # --- what happens meanwhile -----------------------------------------------------------------

@@ -72,6 +72,18 @@ def test_others_are_answered_between_its_turns(inner: Inner, made: DividedMap) -
 
 
 @short_turns
+def test_what_a_client_is_given_is_noted_with_the_reply(inner: Inner, made: DividedMap) -> None:
+    """Else a client that leaves at once, and keeps what it maps, would be known to no one."""
+    one = inner(str(made.root))
+    one.everything(999)
+    session = one.session()
+    work = one.cells.area(session, Area(1, EVERYWHERE))
+    while not any(reply.request == 1 for _, reply in one.replies):
+        next(work)
+    assert len(session.held) == CELLS
+
+
+@short_turns
 def test_nothing_stays_of_one_whose_client_leaves_meanwhile(inner: Inner, made: DividedMap) -> None:
     """Wherever it is then: nothing is kept for it."""
     one = inner(str(made.root))
