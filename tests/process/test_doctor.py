@@ -17,7 +17,7 @@ from tests.support.forked_programs import run_verb
 
 
 def test_from_health_to_death(daemon: DaemonFactory, divided_map: DividedMap) -> None:
-    one = daemon(divided_map.root)
+    one = daemon(divided_map.root, "--budget", "64M")  # less than others leave of the machine's memory
     code, found = doctor(one)
     assert code == 0, found
     well = (

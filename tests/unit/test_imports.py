@@ -241,6 +241,8 @@ def test_no_test_file_imports_another() -> None:
 
 @pytest.mark.parametrize("module", [*modules(), *modules(CLIENTS)])
 def test_all_is_sorted_and_true(module: str) -> None:
+    if module.startswith("shmmap_clients.ros_bridge"):
+        pytest.importorskip("cyclonedds", reason="needs the package cyclonedds")
     loaded = importlib.import_module(module)
     names = getattr(loaded, "__all__", None)
     if names is None:
