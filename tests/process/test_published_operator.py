@@ -98,11 +98,8 @@ def test_damage_and_failures_are_counted(daemon: DaemonFactory, web: FaultyWeb) 
     one.start()
     cells = load_all(one)
     assert len(cells.failed) == 1
-    wanted = {
-        "objects_damaged_in_store": 2,
-        "objects_damaged_on_disk": 1,
-        "fetches_failed": 2,
-    }  # it is asked twice
+    # the store is asked twice
+    wanted = {"objects_damaged_in_store": 2, "objects_damaged_on_disk": 1, "fetches_failed": 2}
     counts_when(one, lambda counts: wanted.items() <= counts.items())
 
     before_ns = time.time_ns()

@@ -63,7 +63,7 @@ def test_an_interrupt_at_any_call_is_the_only_error(monkeypatch: pytest.MonkeyPa
         number += 1
     gc.collect()
     assert number > 50
-    # Python reports an interrupt within a finalizer by itself; since 3.14 also that zipfile cannot finalize what an
-    # interrupt left half made in its constructor
+    # Python reports an interrupt within a finalizer by itself; since 3.14 also that zipfile cannot finalize
+    # what an interrupt left half made in its constructor
     own = KeyboardInterrupt if sys.version_info < (3, 14) else (KeyboardInterrupt, AttributeError)
     assert [error for error in ignored if not isinstance(error, own)] == []
