@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs tasks on cells in worker processes, so that a hostile file fails only its cell, not the run.
 
-The kernel ends the workers with this process.  If a worker dies, only its current task fails, and another
-worker replaces it.  Each packet is one message.  Publishing uses the same tasks.
+The kernel ends the workers with this process.  If a worker dies, another one replaces it and gets its tasks
+again, each alone; a task fails only if a second worker dies of it.  Each packet is one message.  Publishing
+uses the same tasks.
 """
 
 from __future__ import annotations
@@ -111,7 +112,7 @@ class TaskPool(Generic[_Task, _Done]):
     finished
         Called with each task and its message.
     died
-        Called with a task whose worker crashed, and a description of the crash.
+        Called with a task of which two workers died, and a description of the second crash.
     ahead
         Number of tasks assigned to a worker at a time, so that it need not wait for the next one.
     """
@@ -136,6 +137,7 @@ class TaskPool(Generic[_Task, _Done]):
         self._ahead = ahead
         self._tasks: Iterator[_Task] = iter(())
         self._again: list[_Task] = []
+        self._suspects: set[int] = set()
         self._selector = selectors.DefaultSelector()
         self._workers: list[_Worker[_Task]] = []
         self._failed_starts = 0
@@ -206,12 +208,12 @@ class TaskPool(Generic[_Task, _Done]):
             if self._failed_starts >= _FAILED_STARTS:
                 raise InternalError(f"no worker can be started: {how}")
             self._again += tasks
-        elif len(tasks) > 1:  # the culprit is found by giving each task alone to a worker
+        elif len(tasks) == 1 and tasks[0].number in self._suspects:
+            self._died(tasks[0], how)
+        else:  # the culprit is found by giving each task alone to a worker
             self._ahead = 1
+            self._suspects.update(task.number for task in tasks)
             self._again += tasks
-        else:
-            for task in tasks:
-                self._died(task, how)
 
     def _end(self, worker: _Worker[_Task]) -> str:
         self._workers.remove(worker)

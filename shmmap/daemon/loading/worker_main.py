@@ -162,7 +162,7 @@ class _Worker:
             try:
                 _test_hook(job.source.name)
                 step("worker.alloc")
-                made = self._make(job, fd)
+                made = self._make_of_one_state(job, fd)
             finally:
                 os.close(fd)
             header = made.header
@@ -205,6 +205,17 @@ class _Worker:
             self._fail(job, "load_failed", f"{job.source.name}: {why} (divide the map into smaller cells)")
         except Exception as error:  # noqa: BLE001  e.g. in another package's builder: it costs one cell
             self._fail(job, "load_failed", f"{job.source.name}: building {job.layer} failed: {error!r}")
+
+    def _make_of_one_state(self, job: worker_messages.Job, fd: int) -> Made:
+        """Fill the segment; once more if a file was rewritten while it was being read."""
+        stamp = self.reader.stamp(job.source)
+        try:
+            return self._make(job, fd)
+        except MapDataError as error:
+            if error.cause != "changed" and self.reader.stamp(job.source) == stamp:
+                raise
+            os.ftruncate(fd, 0)
+            return self._make(job, fd)
 
     def _make(self, job: worker_messages.Job, fd: int) -> Made:
         """Fill the segment."""

@@ -235,6 +235,27 @@ def test_more_bytes_than_granted(loader: Loader, tmp_path: Path, granted: bool) 
         loader.done(number)
 
 
+@pytest.mark.parametrize("times", [1, 2])
+def test_a_file_that_is_rewritten_while_it_is_read_is_read_once_more(
+    loader: Loader, tmp_path: Path, times: int
+) -> None:
+    """And only once: one that is written all the time fails."""
+    path = write_ascii(tmp_path / "a.pcd", 5000)
+    loader.load(1, path, 8192)
+    for more in range(1, times + 1):
+        assert isinstance(loader.receive()[0], worker_messages.Need)
+        write_ascii(path, 5000 + 5000 * more)
+        loader.send(worker_messages.Decision(True))
+    if times == 1:
+        assert isinstance(loader.receive()[0], worker_messages.Need)
+        loader.send(worker_messages.Decision(True))
+        assert loader.done().points == 10_000
+    else:
+        failed, _ = loader.receive()
+        assert isinstance(failed, worker_messages.Failed)
+        assert failed.code == "load_failed"
+
+
 def test_the_channel_closes_while_it_waits_for_room(loader: Loader, tmp_path: Path) -> None:
     loader.load(1, write_ascii(tmp_path / "a.pcd", 5000), 8192)
     assert isinstance(loader.receive()[0], worker_messages.Need)
