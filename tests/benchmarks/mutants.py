@@ -2,8 +2,8 @@
 """Whether tests notice when the code is broken: mutants drawn at random, and the tests that catch them.
 
     python -m tests.benchmarks.mutants [--tree DIR] draw --seed 29ca3b8 --count 60 > mutants.json
-    python -m tests.benchmarks.mutants [--tree DIR] run mutants.json [--only 3,17] [--together 5]
-                                                                     [--results FILE] [STAGE ...]
+    python -m tests.benchmarks.mutants [--tree DIR] run mutants.json [STAGE ...] [--only 3,17]
+                                                                     [--together 5] [--results FILE]
     python -m tests.benchmarks.mutants carry mutants.json --from OLD > here.json
 
 A mutant is one change of one place: a bound dropped, a comparison turned, a version not compared, a lock not
