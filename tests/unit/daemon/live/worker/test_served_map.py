@@ -9,7 +9,7 @@ import socket
 import threading
 import tracemalloc
 from collections.abc import Callable
-from itertools import count, islice
+from itertools import count, islice, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -128,6 +128,27 @@ def test_what_waits_when_a_session_ends_is_not_applied(serve: Serve, monkeypatch
     one.until(lambda: one.map.status().scans == 1)
     one.turn()
     assert waits not in one.answers
+    assert one.voxels() == reference(first)
+    one.end()
+
+
+def test_what_waits_when_another_session_takes_the_mapper_is_refused(
+    serve: Serve, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another program of the same name: it numbers its scans from there on."""
+    one = serve(waiting_bytes=1, **LATER)
+    blocked = Blocked(monkeypatch, one.live.files, "load")
+    first, second = marked(2)
+    mapper = one.open(session=1).mapper
+    one.send(first, mapper, 1, session=1)
+    one.turn()
+    waits = one.send(second, mapper, 2, session=1)
+    one.turn()
+    assert one.open(session=2).mapper == mapper
+    blocked.may.set()
+    refused = one.answer(waits)
+    assert isinstance(refused, ErrorReply)
+    assert f"does not map as mapper {mapper}" in refused.message
     assert one.voxels() == reference(first)
     one.end()
 
@@ -349,6 +370,22 @@ def test_a_directory_that_cannot_be_flushed_is_tried_again_later(
         assert ticket not in one.answers
     assert one.answer(ticket).scan == 1
     assert one.map.status().problem == ""
+    one.end()
+
+
+def test_the_list_of_files_is_written_once_a_minute(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However often chunks change."""
+    one = serve(**LATER)
+    mapper = one.open().mapper
+    times_s: list[float] = []
+    monkeypatch.setattr(one.live, "list_files", lambda _: times_s.append(one.now_s))
+    scans = marked(10)
+    for number, marks in enumerate(scans, 1):
+        one.answer(one.send(marks, mapper, number))
+        one.now_s += 20.0
+        one.turn()
+    assert len(times_s) > 1
+    assert min(b - a for a, b in pairwise(times_s)) >= served_map.MANIFEST_S
     one.end()
 
 
