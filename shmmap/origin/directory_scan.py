@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from shmmap.errors import MapMissing
 from shmmap.origin.map_layout import is_pcd
 from shmmap.origin.metadata import list_some
+from shmmap.segment.process_limits import raise_limit_behind
 
 __all__ = ["ScannedFiles", "scan"]
 
@@ -81,6 +82,8 @@ def scan(root: str, *, recursive: bool, at: Callable[[str], str] = str) -> Scann
     ------
     MapMissing
         The root cannot be read.
+    LimitReached
+        A limit of this process or the machine does not let it read a directory, which may have cells.
     """
     prefix = os.path.join(root if os.path.isdir(at(root)) else os.path.dirname(root), "")
     skip = len(os.fsencode(prefix))
@@ -98,6 +101,7 @@ def scan(root: str, *, recursive: bool, at: Callable[[str], str] = str) -> Scann
         else:
             found.add(path[skip:], status)
     except OSError as error:
+        raise_limit_behind(error)
         raise MapMissing(f"cannot read {root}: {error.strerror}") from error
     while pending:
         place, directory = pending.pop()
@@ -108,6 +112,7 @@ def scan(root: str, *, recursive: bool, at: Callable[[str], str] = str) -> Scann
             seen.add((status.st_dev, status.st_ino))
             inner = _list_directory(place, directory, skip, found, problems)
         except OSError as error:
+            raise_limit_behind(error)
             problems.setdefault(f"cannot be listed ({error.strerror})", []).append(_readable(directory))
             continue
         directories[os.fsdecode(directory)] = status

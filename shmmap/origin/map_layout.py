@@ -28,6 +28,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from shmmap.errors import MapDataError, MapMissing
+from shmmap.segment.process_limits import raise_limit_behind
 
 __all__ = ["KUBERNETES_LINK", "MapLayout", "OpenedDirectories", "absolute_path", "find_layout", "is_pcd"]
 
@@ -53,21 +54,25 @@ class OpenedDirectories:
                 os.close(fd)
 
     def open(self, path: str) -> None:
-        """Open a directory, relative to an open parent if there is one; skip a path that is no directory."""
+        """Open a directory, relative to an open parent if there is one; skip a path that is no directory.
+
+        Raises
+        ------
+        LimitReached
+            This process or the machine has as many files open as it may.
+        """
         if path in self.descriptors:
             return
         flags = os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC
         try:
             fd = os.open(self.at(path), flags)
-        except OSError:  # reading the directory reports the error later
+        except OSError as error:  # other errors are reported when the directory is read
+            raise_limit_behind(error)
             return
-        if _is_volume(fd):
-            volume = fd
-            try:
-                fd = os.open(KUBERNETES_LINK, flags, dir_fd=volume)
-            finally:
-                os.close(volume)
         self.descriptors[path] = fd
+        if _is_volume(fd):
+            self.descriptors[path] = os.open(KUBERNETES_LINK, flags, dir_fd=fd)
+            os.close(fd)
 
     def at(self, path: str) -> str:
         """Return the path by which this process can open ``path``: below the innermost open directory."""
@@ -99,7 +104,8 @@ def _is_volume(fd: int) -> bool:
         with os.scandir(place) as entries:
             visible = [entry.path for entry in entries if not entry.name.startswith("..")]
         return all(os.readlink(path).startswith(KUBERNETES_LINK + "/") for path in visible)
-    except OSError:
+    except OSError as error:
+        raise_limit_behind(error)
         return False
 
 
@@ -163,6 +169,8 @@ def find_layout(path: str, metadata: str | None, opened: OpenedDirectories | Non
     ------
     MapMissing
         Nothing exists at ``path``, or it is not a map.
+    LimitReached
+        This process or the machine has as many files open as it may.
     """
     opened = opened or OpenedDirectories()
     opened.open(os.path.dirname(path))
@@ -207,5 +215,6 @@ def _holds_pcd(directory: str) -> bool:
     try:
         with os.scandir(directory) as entries:
             return any(is_pcd(os.fsencode(entry.name)) and entry.is_file() for entry in entries)
-    except OSError:
+    except OSError as error:
+        raise_limit_behind(error)
         return False

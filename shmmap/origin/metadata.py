@@ -31,6 +31,7 @@ import yaml
 from numpy.typing import NDArray
 
 from shmmap.errors import MapDataError, MapMissing
+from shmmap.segment.process_limits import raise_limit_behind
 
 __all__ = [
     "MAX_METADATA_BYTES",
@@ -234,6 +235,8 @@ def metadata_bytes(path: str, max_bytes: int = MAX_METADATA_BYTES, *, at: str = 
     ------
     MapMissing
         The file does not exist, or may not be read.
+    LimitReached
+        A limit of this process or the machine does not let it open the file.
     MapDataError
         The file is larger than ``max_bytes``; the error's cause is `TOO_LARGE`.
     """
@@ -241,6 +244,7 @@ def metadata_bytes(path: str, max_bytes: int = MAX_METADATA_BYTES, *, at: str = 
         with open(at or path, "rb") as file:
             data = file.read(max_bytes + 1)
     except OSError as error:
+        raise_limit_behind(error)
         raise MapMissing(f"cannot read the map's metadata {path}: {error.strerror}") from error
     if len(data) > max_bytes:
         raise MapDataError(

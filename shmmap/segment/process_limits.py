@@ -27,6 +27,7 @@ __all__ = [
     "no_files_left",
     "no_memory_left",
     "no_threads_left",
+    "raise_limit_behind",
 ]
 
 _GONE_S: Final = 0.0001
@@ -62,6 +63,18 @@ def limit_behind(error: BaseException) -> LimitReached | None:
     if is_memory or (isinstance(error, ImportError) and any(text in str(error) for text in _NO_ROOM)):
         return no_memory_left()
     return None
+
+
+def raise_limit_behind(error: OSError) -> None:
+    """Raise the error that names the limit which caused ``error``; do nothing if no limit did.
+
+    Raises
+    ------
+    LimitReached
+        A limit caused it.
+    """
+    if (limit := limit_behind(error)) is not None:
+        raise limit from error
 
 
 def check_files(count: int, what: str) -> None:

@@ -3,15 +3,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import resource
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from shmmap.errors import MapDataError, MapMissing
+from shmmap.errors import LimitReached, MapDataError, MapMissing
 from shmmap.geometry import Circle
 from shmmap.origin.catalogue_change import compare
 from shmmap.origin.map_directory import MapDirectory, open_map
@@ -317,6 +319,51 @@ def test_reload_sees_what_changed(tmp_path: Path) -> None:
     assert change.ids("removed") == (str(cells / "t_20_0.pcd"),)
     assert change.ids("changed") == (str(cells / "t_0_0.pcd"),)
     assert before.map_version != origin.load().map_version
+
+
+@contextlib.contextmanager
+def only(count: int) -> Iterator[None]:
+    """Limit how many more files this process can open."""
+    free = [os.open("/", os.O_PATH) for _ in range(count + 1)]
+    for fd in free:
+        os.close(fd)
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(free), hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+@pytest.mark.parametrize("kind", ["divided", "volume", "nested", "inside"])
+def test_without_descriptors_a_map_is_whole_or_the_limit_is_named(tmp_path: Path, kind: str) -> None:
+    """A directory that could not be opened would be cells that are gone, or a link that may be switched."""
+    root = tmp_path / "map"
+    if kind == "volume":
+        autoware_map(root / "..2026")
+        (root / "..data").symlink_to("..2026")
+        for name in ("pointcloud_map.pcd", "pointcloud_map_metadata.yaml"):
+            (root / name).symlink_to(f"..data/{name}")
+    elif kind == "inside":
+        root = autoware_map(root) / "pointcloud_map.pcd"
+    else:
+        autoware_map(root)
+    if kind == "nested":
+        cells = root / "pointcloud_map.pcd"
+        (cells / "inner").mkdir()
+        (cells / NAMES[0]).rename(cells / "inner" / NAMES[0])
+    whole = open_map(root).load().map_version
+    refused: list[str] = []
+    versions: list[int] = []
+    for count in range(12):
+        with only(count):
+            try:
+                versions.append(open_map(root).load().map_version)
+            except LimitReached as error:
+                refused.append(error.hint)
+    assert versions == [whole] * (12 - len(refused))
+    assert len(refused) > 2
+    assert all("LimitNOFILE=" in hint for hint in refused)
 
 
 def test_a_map_directory_knows_its_name(tmp_path: Path) -> None:
