@@ -405,7 +405,11 @@ class Residency:
             rank, chunk = found.pop()
             if chunk.state is state and self.chunks.get(chunk.key) is chunk and chunk.retry_s <= now_s:
                 may_go = self._may_go(chunk, now_s, short)
-                if may_go and not (state is State.DIRTY and self._has_clean(rank, now_s, short)):
+                if state is State.DIRTY:
+                    others_first = self._has_clean(rank, now_s, short)
+                else:
+                    others_first = bool(chunk.waiting) and self._becomes_clean(now_s)
+                if may_go and not others_first:
                     return chunk
                 if may_go or short < self._reviewed[state]:  # evicted when memory is shorter again
                     found.append((rank, chunk))
@@ -421,6 +425,11 @@ class Residency:
             and found[-1][1].state is State.CLEAN
             and self._may_go(found[-1][1], now_s, short)
         )
+
+    def _becomes_clean(self, now_s: float) -> bool:
+        """Return whether saves make memory free, so that no chunk need be evicted that a scan waits for."""
+        can_save = now_s >= self._save_s and any(not one.waiting for one in self._dirty.values())
+        return bool(self.saving) or can_save
 
     def _note_change(self) -> None:
         """Count a chunk that was loaded, changed or saved."""

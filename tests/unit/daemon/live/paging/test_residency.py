@@ -258,7 +258,9 @@ def test_where_one_file_cannot_be_written_no_other_is_tried_at_once() -> None:
     assert one.next_save(50.0 + RETRY_S) is chunks[1]
 
 
-def test_a_scan_without_memory_does_not_hold_up_others() -> None:
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_scan_without_memory_does_not_hold_up_others(fails: bool) -> None:
+    """It gets the memory of a chunk that is saved; of one that a scan waits for only if that fails."""
     one = Residency(Limits(40, radius=0, loads=9), new_bytes=10)
     chunks = []
     for x in range(3):
@@ -271,7 +273,15 @@ def test_a_scan_without_memory_does_not_hold_up_others() -> None:
     seen = [one.is_ready]
     apply(one, chunks[2])
     seen.append(one.is_ready)
-    assert one.next_eviction(9.0) is not None
+    assert one.next_eviction(9.0) is None
+    assert one.next_save(9.0) is chunks[2]
+    assert one.next_eviction(9.0) is None
+    if fails:
+        one.save_failed(chunks[2], 9.0)
+    else:
+        one.saved(chunks[2], chunks[2].version, 9.0)
+    gone = one.next_eviction(9.0 + REVIEW_S)
+    assert gone in chunks[:2] if fails else gone is chunks[2]
     seen.append(one.is_ready)
     assert seen == [True, False, True], "there is room now"
 
