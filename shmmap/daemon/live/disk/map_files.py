@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """A live map on disk: its settings, its mappers, and a file for each of its chunks.
 
-- ``map.json`` holds the map's settings and every mapper's number; a change is on disk before it is used. -
-``3_-1_0.chunk`` is a chunk (``shmmap/chunks/CHUNKS.md``).  It is written under another name; from then on
-  no death of a process loses it, and its memory may be freed.  `MapFiles.flush` brings it to the disk, then
-  into the place of an older one, and then it is *durable*.  Until then its bytes are kept, in case the disk
-  fails, and for the next load: a file that is written often is flushed seldom.
+- ``map.json`` holds the map's settings and every mapper's number; a change is on disk before it is used.
+- ``3_-1_0.chunk`` is a chunk (``shmmap/chunks/CHUNKS.md``).  It is first written under another name.  From
+  then on no death of a process loses it, and its memory may be freed.  `MapFiles.flush` brings it to the disk
+  and then into the place of an older one: now it is *durable*.  Until then its bytes are kept, in case the
+  disk fails, and for the next load: a file that is written often is flushed seldom.
 - ``manifest.json`` lists the durable chunks.  It is written last, and only serves to detect chunks removed
-since; all other data is read from the chunks' headers. - A damaged file is quarantined as
-``3_-1_0.chunk.damaged.1``, reported, and never overwritten.  A file that
+  since; all other data is read from the chunks' headers.
+- A damaged file is quarantined as ``3_-1_0.chunk.damaged.1``, reported, and never overwritten.  A file that
   the system does not let this process read may be good: then the map cannot be opened, and nothing changes.
 """
 

@@ -5,11 +5,12 @@ Pure decisions: clock and sizes are injected.  The owner of the memory asks for 
 `ready`, `next_save`, `next_eviction`), carries it out, and reports that.
 
 - A chunk is loaded because a scan waits for it, or because it is near a client.  It stays until its memory is
-needed.  For a chunk near a client, only chunks near no client are evicted; for a scan, any chunk, the
-furthest first. - A scan is never dropped: it waits for chunks that are not in memory, and scans are applied
-in order of arrival.  The memory of waiting scans is bounded; beyond that no scan is accepted (`has_room`). -
-A changed chunk is saved before it is evicted (once memory is half full, in advance), and is durable after
-`Limits.checkpoint_s`.  A chunk that changes while it is saved is dirty again.
+  needed.  For a chunk near a client, only chunks near no client are evicted; for a scan, any chunk, the
+  furthest first, and one that a scan waits for only if no save makes memory free.
+- A scan is never dropped: it waits for chunks that are not in memory, and scans are applied in order of
+  arrival.  The memory of waiting scans is bounded; beyond that no scan is accepted (`has_room`).
+- A changed chunk is saved before it is evicted (once memory is half full, in advance), and is durable after
+  `Limits.checkpoint_s`.  A chunk that changes while it is saved is dirty again.
 """
 
 from __future__ import annotations
