@@ -109,6 +109,10 @@ class Soak:
             subprocess.Popen([*command, str(self.numbers), str(half), str(PAUSE_S / self.pace)], cwd=ROOT)
         )
 
+    def count(self, name: str) -> int:
+        """Return one of the daemon's counters."""
+        return read_statistics(self.one.instance, self.one.shm_dir).counters[name]
+
     def sample(self) -> None:
         """Look at everything once."""
         self.samples += 1
@@ -116,7 +120,7 @@ class Soak:
         loaders = sum(status(pid)[0] for pid in self.one.children())
         names = os.listdir(self.one.shm_dir)
         seen = {
-            "sessions": read_statistics(self.one.instance, self.one.shm_dir).counters["sessions"],
+            "sessions": self.count("sessions"),
             "rss_kib": rss, "threads": threads, "loaders_kib": loaders, "names": len(names),
             # retired segments that are still mapped are kept open, and are not what could leak
             "descriptors": len(os.listdir(f"/proc/{self.one.pid}/fd"))
@@ -203,12 +207,15 @@ class Soak:
             client.kill()
             client.wait()
         with shmmap.connect(self.one.endpoint, timeout=60.0, connect_timeout=60.0) as operator:
-            until_s = time.monotonic() + 30
-            while self.one.segments() and time.monotonic() < until_s:
-                operator.evict()  # more than once: loads that the dead asked for go on
+            began_s = time.monotonic()
+            until_s, loads, evicted = began_s + 30, self.count("loads_finished"), None
+            while (left := self.one.segments()) and time.monotonic() < until_s:
+                evicted = operator.evict()  # more than once: loads that the dead asked for go on
+                if loads != (loads := self.count("loads_finished")):
+                    until_s = min(time.monotonic() + 30, began_s + 300)
                 time.sleep(0.02)
-        if self.one.segments():
-            self.problems.append(f"{len(self.one.segments())} segments are left that no process maps")
+        if left:
+            self.problems.append(f"{left} are left that no process maps; the last evict: {evicted}")
 
     def judge(self) -> dict[str, list[float]]:
         """Medians after the warm-up and at the end; what grew becomes a problem."""
