@@ -100,7 +100,7 @@ def run_workers(
     finished
         Called with each task and its result.
     died
-        Called with a task whose worker crashed, and a description of the crash.
+        Called with a task of which two workers died, and a description of the second crash.
 
     Raises
     ------

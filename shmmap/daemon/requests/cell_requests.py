@@ -504,7 +504,7 @@ class CellRequests:
             yield from pace.pause()
             if not session.is_connected:
                 return
-        if len(residents) > LARGE:  # freeing what it took takes time, too
+        if len(residents) > LARGE:  # freeing these lists takes time, too
             yield
 
     # --- what happens meanwhile -----------------------------------------------------------------
