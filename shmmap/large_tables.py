@@ -92,6 +92,11 @@ class ShardedDict(MutableMapping[K, V]):
         for shard in self._shards:
             yield from shard
 
+    def walk(self) -> Iterator[K]:
+        """Yield the keys; keys added during the walk may be left out, removed ones may still be yielded."""
+        for shard in self._shards:
+            yield from list(shard)
+
     def __len__(self) -> int:
         return sum(map(len, self._shards))
 

@@ -55,6 +55,19 @@ def test_it_does_what_a_dict_does(steps: list[tuple[str, int]]) -> None:
     assert (len(ours), set(ours), sorted(ours.values())) == (len(plain), set(plain), sorted(plain.values()))
 
 
+@pytest.mark.parametrize("count", [1, 3, 5000])
+def test_a_walk_sees_what_stays_though_others_come_and_go(count: int) -> None:
+    ours: ShardedDict[int, int] = ShardedDict()
+    for key in range(count):
+        ours[key] = 0
+    seen = set()
+    for key in ours.walk():
+        seen.add(key)
+        ours.pop(key * 7 % count // 2 * 2, None)  # an even one, seen or not
+        ours[count + len(seen)] = 0
+    assert seen.issuperset(range(1, count, 2))
+
+
 def test_few_entries_are_in_one_dict_and_many_in_none_that_is_large() -> None:
     ours: ShardedDict[int, int] = ShardedDict()
     ours[1] = 1

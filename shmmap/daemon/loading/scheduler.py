@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterator
+from itertools import islice
 from typing import Final, Protocol
 
 from shmmap.daemon.cache.cell_cache import CellCache
@@ -23,6 +24,7 @@ from shmmap.daemon.loading.worker_messages import Begun, Check, Checked, Done, E
 from shmmap.daemon.loading.worker_pool import NOT_OPENED, Opened, Worker, WorkerPool
 from shmmap.daemon.records import SPACE_CODES, Failure, Key, Load, Resident, failure_code
 from shmmap.failpoints import step
+from shmmap.large_tables import ShardedDict
 from shmmap.layers.points import LAYER
 from shmmap.layers.sources import Neighbour
 from shmmap.logfmt import log
@@ -48,8 +50,8 @@ class MisplacedCells:
 
     def __init__(self, cache: CellCache) -> None:
         self._cache = cache
-        self._versions: dict[str, int] = {}  # version of the cell when it was loaded
-        self._to_check: deque[str] = deque()
+        self._versions: ShardedDict[str, int] = ShardedDict()  # of the cell when it was loaded
+        self._to_check: Iterator[str] = iter(())
 
     def note(self, cell_id: str, index: int, outside: int) -> None:
         """Note how many points of a loaded or adopted segment lie outside its cell's box."""
@@ -70,12 +72,11 @@ class MisplacedCells:
 
     def map_changed(self) -> None:
         """Let `check_some` check all cells again: they may have changed, or left the map."""
-        self._to_check = deque(self._versions)
+        self._to_check = self._versions.walk()
 
     def check_some(self, most: int) -> None:
         """Check at most ``most`` cells, and forget those that have changed or left the map."""
-        for _ in range(min(most, len(self._to_check))):
-            cell_id = self._to_check.popleft()
+        for cell_id in islice(self._to_check, most):
             index = self._cache.catalogue.find(cell_id)
             if index is None or self._cache.catalogue.version(index) != self._versions.get(cell_id):
                 self._forget(cell_id)
