@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cache
 from typing import Final
 
@@ -88,8 +88,10 @@ class PackedArray:
         self._count += len(elements)
         self._parts.append(b"".join(elements))
 
-    def __bytes__(self) -> bytes:
-        return b"".join((_head(self._count), *self._parts))
+    def parts(self) -> Iterator[bytes]:
+        """Yield the encoded array in parts."""
+        yield _head(self._count)
+        yield from self._parts
 
 
 def _head(count: int) -> bytes:
@@ -123,7 +125,7 @@ def encode_cells(
     dropped = encode((removed, removed_packed))
     end = encode((layers, covered, reason))
     # one array of twelve elements instead of three: replace their one-byte heads
-    parts = (start[1:], bytes(handles), dropped[1:], bytes(pending), bytes(failed), end[1:])
+    parts = (start[1:], *handles.parts(), dropped[1:], *pending.parts(), *failed.parts(), end[1:])
     return b"".join((b"\x9c", *parts))
 
 

@@ -74,7 +74,7 @@ class LoadQueue:
     def count(self, asker: Hashable) -> int:
         """Return how many loads of an asker are queued."""
         mine = self._askers.get(asker)
-        return 0 if mine is None else sum(number in self._loads for number in mine.best)
+        return 0 if mine is None else sum(map(self._loads.__contains__, mine.best))
 
     def push(self, load: Load, priority: float, asker: Hashable) -> None:
         """Queue a load for an asker; queued again, it may move forward but never back."""

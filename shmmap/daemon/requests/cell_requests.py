@@ -129,8 +129,7 @@ class CellRequests:
         _note_area(session, area, layers)
 
         def find(wanted: PendingRequest) -> Generator[None, None, None]:
-            known = self._known(wanted, layers)
-            yield from wanted.pause(now=len(known) > LARGE)
+            known = yield from self._known(wanted, layers)
             for indices in batched(known):
                 yield from wanted.pause()
                 wanted.found.cells += [(index, layer) for index in indices for layer in layers]
@@ -182,7 +181,9 @@ class CellRequests:
         _note_area(session, area, layers)
 
         def find(wanted: PendingRequest) -> Generator[None, None, None]:
-            return difference(wanted, message, self._known(wanted, layers), layers)
+            yield from wanted.pause(now=len(cells) > MAX_COMPARED)  # finding them all takes a turn
+            known = yield from self._known(wanted, layers)
+            yield from difference(wanted, message, known, layers)
 
         held_cells = len(message.packed) // PACKED_PER_CELL + len(message.held) // HELD_PER_CELL
         return self._serve(self._pending(session, message, find, area, held_cells), message.wait)
@@ -208,7 +209,7 @@ class CellRequests:
         for layer in layers:
             versions.check_reach(layer)
 
-    def _known(self, wanted: PendingRequest, layers: tuple[str, ...]) -> list[int]:
+    def _known(self, wanted: PendingRequest, layers: tuple[str, ...]) -> Generator[None, None, list[int]]:
         """Find the known cells of an area; note whether more may exist, and the pages that may list them.
 
         A layer that reads neighbouring cells needs the pages of these, too.
@@ -217,6 +218,8 @@ class CellRequests:
         ------
         BadRequest
             The area has too many cells.
+        MapChanged, NoSession
+            See `PendingRequest.pause`.
         """
         area, found, catalogue = wanted.area, wanted.found, self._cache.catalogue
         assert area is not None  # noqa: S101  only requests by ids have no area
@@ -232,6 +235,7 @@ class CellRequests:
             found.pages = {page for page in absent if not pages.is_out_of_reach(page)}
             found.reason = "offline" if len(found.pages) < len(absent) else ""
             pages.want(needed, 0.0)
+        yield from wanted.pause(now=len(indices) > LARGE)
         return self._cache.at_height(indices.tolist(), area.z)
 
     def release(self, residents: Iterable[Resident]) -> None:

@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 
-from shmmap.daemon.transport.zmtp import GREETING, Incoming, framed
+from shmmap.daemon.transport.zmtp import GREETING, Incoming, framed, framed_in_parts
 from shmmap.daemon.turns import WatchedDescriptors
 from shmmap.errors import BadRequest, ProtocolMismatch, ShmmapError
 from shmmap.failpoints import step
@@ -106,7 +106,8 @@ class Connection:
     def reply(self, body: bytes) -> None:
         """Send a reply; a client that leaves too much unread loses the connection with the replies."""
         step("daemon.reply")
-        self._send(framed(body))
+        for part in framed_in_parts(body):
+            self._send(part)
         step("daemon.replied")
         self._listener.statistics.add("replies")
         self._listener.statistics.add("bytes_sent", len(body))

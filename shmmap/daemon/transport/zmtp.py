@@ -13,10 +13,13 @@ from typing import Final
 
 from shmmap.errors import BadRequest, ProtocolMismatch
 
-__all__ = ["GREETING", "Incoming", "framed"]
+__all__ = ["GREETING", "Incoming", "framed", "framed_in_parts"]
 
 GREETING: Final = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)
 """Signature, version 3.0, mechanism, and 32 bytes that NULL ignores."""
+
+MAX_COPIED_BYTES: Final = 1 << 16
+"""Longest body that is copied to follow its head in one call of the kernel."""
 
 _MORE: Final = 1
 _LONG: Final = 2
@@ -25,9 +28,18 @@ _COMMAND: Final = 4
 
 def framed(body: bytes, flags: int = 0) -> bytes:
     """Return one frame: a complete message, unless ``flags`` mark it otherwise."""
+    return _head(body, flags) + body
+
+
+def framed_in_parts(body: bytes) -> tuple[bytes, ...]:
+    """Return a complete message, in two parts if its body is long: to copy it would take long."""
+    return (framed(body),) if len(body) <= MAX_COPIED_BYTES else (_head(body, 0), body)
+
+
+def _head(body: bytes, flags: int) -> bytes:
     if len(body) < 256:
-        return bytes((flags, len(body))) + body
-    return bytes((flags | _LONG,)) + len(body).to_bytes(8, "big") + body
+        return bytes((flags, len(body)))
+    return bytes((flags | _LONG,)) + len(body).to_bytes(8, "big")
 
 
 class Incoming:

@@ -271,4 +271,4 @@ def test_an_array_in_parts(count: int, at_once: int) -> None:
     for begin in range(0, count, at_once):
         array.add([begin] * min(at_once, count - begin))
     whole = [number // at_once * at_once for number in range(count)]
-    assert bytes(array) == encode(whole)
+    assert b"".join(array.parts()) == encode(whole)

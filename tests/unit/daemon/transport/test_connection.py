@@ -240,7 +240,7 @@ def test_replies_that_are_not_read(loop: Loop) -> None:
     """They are kept up to a limit, whole; beyond it they and the connection are lost."""
     one = loop.raw(GREETING + READY)
     (connection,) = loop.connections
-    sent = [bytes([n]) * 300_000 for n in range(20)]
+    sent = [bytes([n]) * 300_000 for n in range(20)] + [bytes(1 << 16), bytes((1 << 16) + 1), b"short"]
     for body in sent:
         connection.reply(body)
     assert loop.connections.nbytes == connection.unsent_bytes > 5_000_000
