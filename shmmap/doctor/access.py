@@ -17,7 +17,7 @@ from itertools import islice
 from typing import Any, Final
 
 from shmmap.daemon.prerequisites import account_name
-from shmmap.doctor.diagnosis import Diagnosis
+from shmmap.doctor.diagnosis import ANSWER_S, Diagnosis
 from shmmap.doctor.verdicts import Finding, fail, ok, outage_so_far, skip, warn
 from shmmap.errors import (
     DaemonUnreachable,
@@ -43,7 +43,6 @@ __all__ = [
     "paths_of_service",
 ]
 
-ANSWER_S: Final = 2.0
 LOOKED_AT: Final = 256
 """Files of a map whose permissions are checked; those of one map rarely differ."""
 _UNITS: Final = "/etc/systemd/system"

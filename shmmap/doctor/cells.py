@@ -7,14 +7,13 @@ import math
 import time
 from typing import Final
 
-from shmmap.doctor.diagnosis import Diagnosis
+from shmmap.doctor.diagnosis import ANSWER_S, Diagnosis
 from shmmap.doctor.verdicts import Finding, cache_verdict, fail, ok, outage_so_far, warn
 from shmmap.errors import ShmmapError
 from shmmap.quantities import counted, format_bytes, format_duration
 
 __all__ = ["check_cache", "check_cells", "check_prefetching"]
 
-ANSWER_S: Final = 2.0
 SHORT: Final = ("out of memory", "of memory that a loader may use")
 """Texts in messages of loads that failed for lack of memory."""
 NAMED: Final = 3

@@ -18,7 +18,10 @@ from shmmap.origin.remote.store import is_published, is_url
 from shmmap.statistics.identity import DaemonIdentity
 from shmmap.statistics.snapshot import Snapshot
 
-__all__ = ["Diagnosis", "Machine", "answering_at"]
+__all__ = ["ANSWER_S", "Diagnosis", "Machine", "answering_at"]
+
+ANSWER_S: Final = 2.0
+"""Seconds that a check waits for the daemon's answer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,7 +162,6 @@ class Diagnosis:
         return self.uid
 
 
-ASKED_S: Final = 2.0
 _UNIT: Final = "/etc/systemd/system/shmmapd.service"
 _LISTENS: Final = 1 << 16  # __SO_ACCEPTCON of linux/net.h
 
@@ -172,7 +174,7 @@ def answering_at(path: str) -> dict[str, int]:
     if not is_served(path):
         return {}
     try:
-        with connect(path, timeout=ASKED_S, connect_timeout=ASKED_S, name="shmmap doctor") as client:
+        with connect(path, timeout=ANSWER_S, connect_timeout=ANSWER_S, name="shmmap doctor") as client:
             return {client.welcome.instance: client.welcome.pid}
     except ShmmapError:
         return {}

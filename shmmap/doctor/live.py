@@ -13,7 +13,7 @@ from typing import Final
 from shmmap.daemon.config_live import SERVICE_STATE, live_directory
 from shmmap.daemon.prerequisites import account_name
 from shmmap.doctor.access import group_name, groups_of, is_in, paths_of_service
-from shmmap.doctor.diagnosis import Diagnosis
+from shmmap.doctor.diagnosis import ANSWER_S, Diagnosis
 from shmmap.doctor.memory import mount_of
 from shmmap.doctor.verdicts import Finding, fail, ok, skip, warn
 from shmmap.errors import ConfigError, ShmmapError
@@ -23,7 +23,6 @@ from shmmap.segment.directory import DEFAULT_SHM_DIR
 
 __all__ = ["check_live_disk", "check_live_maps", "check_live_memory"]
 
-ANSWER_S: Final = 2.0
 NAMED: Final = 3
 """Problems and readers that are listed, at most."""
 OPEN: Final = 8
