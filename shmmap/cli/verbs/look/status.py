@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from shmmap.cli.areas import moved_by
+from shmmap.cli.daemon_address import connect, snapshot
 from shmmap.cli.options import Subparsers, add_daemon_options, add_statistics_options, add_verb
 from shmmap.cli.screens.output import (
     Column,
@@ -63,8 +64,6 @@ def add_status(subparsers: Subparsers) -> None:
 
 def run_status(args: argparse.Namespace) -> int:
     """Print the state of the daemon."""
-    from shmmap.cli.daemon_address import snapshot
-
     found, identity = snapshot(args)
     if args.json:
         from shmmap.cli.verbs.look.outputs import Status
@@ -211,8 +210,6 @@ def add_clients(subparsers: Subparsers) -> None:
 
 def run_clients(args: argparse.Namespace) -> int:
     """Print the table of clients."""
-    from shmmap.cli.daemon_address import connect
-
     with connect(args) as client:
         stats = client.stats()
     if args.json:

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
+from shmmap.cli.daemon_address import endpoint
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb, seconds
 from shmmap.cli.program import complain
 from shmmap.cli.screens.output import (
@@ -73,7 +74,6 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print events until interrupted."""
-    from shmmap.cli.daemon_address import endpoint
     from shmmap.client.event_stream import EventStream
 
     follow = sys.stdout.isatty() if args.follow is None else args.follow
