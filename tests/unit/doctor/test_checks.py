@@ -70,6 +70,8 @@ def test_a_disk_cache_in_order(ward: Ward, monkeypatch: pytest.MonkeyPatch) -> N
     assert found.fact.startswith("/var/town: 9.8 KiB of 1.0 MiB used, ")
     monkeypatch.setenv("CACHE_DIRECTORY", "/var/town")
     assert memory.check_disk_cache(ward.diagnosis(uid=uid)).fact.startswith("/var/town: 9.8 KiB of 8.0 GiB")
+    found = memory.check_disk_cache(ward.diagnosis(uid=uid, cache_dir="/var/town/layers/ab/1.layer"))
+    assert (found.state, found.fact) == ("warn", "/var/town/layers/ab/1.layer is no directory")
 
 
 @pytest.mark.parametrize("mode", [0o775, 0o1777])
@@ -93,12 +95,6 @@ def test_a_disk_cache_of_another_user(ward: Ward, which: str) -> None:
     for name in ("var/town", "var/town/objects"):
         os.chown(ward.root / name, USER, -1)
     assert memory.check_disk_cache(ward.diagnosis(uid=USER, cache_dir="/var/town")).state == "ok"
-
-
-def test_a_disk_cache_that_is_none(ward: Ward) -> None:
-    ward.file("/var/town", "a file")
-    found = memory.check_disk_cache(ward.diagnosis(uid=os.geteuid(), cache_dir="/var/town"))
-    assert (found.state, found.fact) == ("warn", "/var/town is no directory")
 
 
 def test_a_disk_cache_without_room(ward: Ward, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -495,10 +491,6 @@ def test_chunks_of_a_daemon_that_does_not_run_are_no_rubbish(ward: Ward) -> None
     assert daemon.check_leftovers(ward.diagnosis(snapshot())).state == "ok"
 
 
-def test_a_daemon_that_keeps_live_maps_alone_needs_no_map(ward: Ward) -> None:
-    assert access.check_map_access(ward.diagnosis(live=(LiveSettings("lidar"),))).state == "ok"
-
-
 # --- kernel ---
 
 
@@ -572,6 +564,7 @@ def test_maps(tmp_path: Path, ward: Ward) -> None:
     made = make_map(tmp_path / "map", columns=2, rows=1, points=3)
     path = str(made.root)
     assert access.check_map_access(ward.diagnosis()).state == "warn"
+    assert access.check_map_access(ward.diagnosis(live=(LiveSettings("lidar"),))).state == "ok"
     assert access.check_map_access(ward.diagnosis(map_path=str(tmp_path / "none"))).state == "fail"
     assert (
         access.check_map_access(ward.diagnosis(snapshot(), map_path=path)).fact
@@ -615,15 +608,13 @@ def test_a_map_in_a_home_directory(tmp_path: Path, ward: Ward, monkeypatch: pyte
         (snapshot("stopped"), "fail"),
         (snapshot("hung"), "fail"),
         (snapshot(version="0.0.0"), "warn"),
+        (None, "warn"),
     ],
 )
-def test_the_daemon(ward: Ward, seen: Snapshot, state: str) -> None:
-    assert daemon.check_daemon(ward.diagnosis(seen)).state == state
-
-
-def test_statistics_of_others(ward: Ward) -> None:
-    diagnosis = dataclasses.replace(ward.diagnosis(), seen=None, unreadable="no")
-    assert daemon.check_daemon(diagnosis).state == "warn"
+def test_the_daemon(ward: Ward, seen: Snapshot | None, state: str) -> None:
+    """Without its statistics if they are another user's."""
+    diagnosis = dataclasses.replace(ward.diagnosis(), seen=seen, unreadable="no")
+    assert daemon.check_daemon(diagnosis).state == state
 
 
 def test_leftovers(ward: Ward) -> None:
@@ -663,15 +654,12 @@ def test_leftovers(ward: Ward) -> None:
     ],
 )
 def test_logind(ward: Ward, files: dict[str, str], state: str) -> None:
+    assert daemon.check_logind(ward.diagnosis()).state == "ok", "without systemd"
     (ward.root / "run/systemd/system").mkdir(parents=True)
     for name, text in files.items():
         ward.file(name, text)
     assert daemon.check_logind(ward.diagnosis()).state == state
     assert daemon.check_logind(ward.diagnosis(uid=995)).state == "ok"
-
-
-def test_logind_without_systemd(ward: Ward) -> None:
-    assert daemon.check_logind(ward.diagnosis()).state == "ok"
 
 
 def test_reloads(ward: Ward) -> None:
