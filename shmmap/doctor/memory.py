@@ -70,16 +70,13 @@ def check_shared_memory(diagnosis: Diagnosis) -> Finding:
     if not budget:
         return ok(f"{fact}; the budget is chosen at start")
     fact += f"; budget {format_bytes(budget)}, of which {format_bytes(used)} taken"
-    enlarge = f"lower the budget, or enlarge it: `mount -o remount,size={_enough(budget)} {mount.point}`"
+    enough_gib = -(-(budget * 5 // 4) // (1 << 30))
+    enlarge = f"lower the budget, or enlarge it: `mount -o remount,size={enough_gib}G {mount.point}`"
     if budget > free + used:
         return fail(fact, enlarge)
     if budget > 0.95 * size:
         return warn(fact, f"nothing is left for others: {enlarge}")
     return ok(fact)
-
-
-def _enough(budget: int) -> str:
-    return f"{-(-(budget * 5 // 4) // (1 << 30))}G"
 
 
 def check_container(diagnosis: Diagnosis) -> Finding:

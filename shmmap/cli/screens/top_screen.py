@@ -293,12 +293,12 @@ def _clients(
     column = max(_SHORTEST_NAME, min(max(map(len, names), default=0), room))
     lines: list[Line] = [[(f"{'CLIENT':{column}}{rest}"[:width], "bold")]]
     for client, name, at in zip(shown, names, places, strict=True):
-        idle_s = max(now_ns - client.last_request_monotonic_ns, 0) * 1e-9
         called = name if len(name) <= column else f"{name[: column - 1]}…"
         uid = f" {client.uid:>6}" if with_uid else ""
         row = (
             f"{called:{column}} {client.pid or '?':>8}{uid} {client.cells:>6,}"
-            f" {format_bytes(client.bytes):>9} {client.requests:>9,} {format_duration(idle_s):>8}  {at}"
+            f" {format_bytes(client.bytes):>9} {client.requests:>9,}"
+            f" {format_duration(client.idle_s(now_ns)):>8}  {at}"
         )
         lines.append([(row[:width], "")])
     more = sessions - len(shown)

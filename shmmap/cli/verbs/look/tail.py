@@ -25,7 +25,7 @@ from shmmap.cli.screens.output import (
 from shmmap.statistics.counters import TURN_KINDS
 
 if TYPE_CHECKING:
-    from shmmap.client.event_stream import EventStream, Happening
+    from shmmap.client.event_stream import Happening
 
 __all__ = ["add_parser", "run"]
 
@@ -89,15 +89,11 @@ def run(args: argparse.Namespace) -> int:
                 show(happening)
                 sys.stdout.flush()
             elif time.monotonic() - stream.last_message_s > SILENT_S:
-                _wait_for_heartbeat(stream, show)
+                # the daemon sends a heartbeat every second: its silence is reported once
+                complain("shmmap", "no heartbeat from the daemon", "shmmap health")
+                show(stream.next(None))
+                sys.stdout.flush()
     return 0
-
-
-def _wait_for_heartbeat(stream: EventStream, show: Callable[[Happening | None], None]) -> None:
-    """Report once that the daemon, which sends a heartbeat every second, is silent."""
-    complain("shmmap", "no heartbeat from the daemon", "shmmap health")
-    show(stream.next(None))
-    sys.stdout.flush()
 
 
 def _is_me(happening: Happening) -> bool:
