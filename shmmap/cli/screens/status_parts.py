@@ -12,6 +12,7 @@ from shmmap.quantities import counted, format_bytes, format_duration, format_utc
 
 if TYPE_CHECKING:
     from shmmap.protocol.rows import LiveMapRow
+    from shmmap.statistics.identity import DaemonIdentity
 
 __all__ = [
     "STATE_STYLES",
@@ -22,7 +23,13 @@ __all__ = [
     "published_words",
     "since",
     "status_lines",
+    "uptime_s",
 ]
+
+
+def uptime_s(identity: DaemonIdentity) -> float:
+    """Return for how long the daemon has run, seconds."""
+    return max(time.time() - identity.started_unix_ns * 1e-9, 0.0)
 
 
 def over_fetch(counters: Mapping[str, int]) -> float | None:

@@ -37,7 +37,8 @@ def test_points_are_finite_and_inside_their_half_open_tile(origin: tuple[float, 
     for bx in range(3):
         for by in range(3):
             xyz, intensity = town.tile(bx, by).values()
-            assert (xyz.dtype, intensity.dtype, intensity.shape) == (np.float32, np.float32, (len(xyz),))
+            assert xyz.dtype == intensity.dtype == np.float32
+            assert intensity.shape == (len(xyz),)
             assert xyz.flags.c_contiguous
             assert np.isfinite(xyz).all()
             assert 0.0 <= intensity.min() <= intensity.max() <= 255.0

@@ -30,6 +30,7 @@ from shmmap.cli.screens.status_parts import (
     published_lines,
     since,
     status_lines,
+    uptime_s,
 )
 from shmmap.doctor.verdicts import cache_verdict, outage_so_far
 from shmmap.errors import DaemonUnreachable
@@ -70,15 +71,15 @@ def run_status(args: argparse.Namespace) -> int:
 
         print_json(Status.of(found, identity))
     else:
-        uptime_s = max(time.time() - identity.started_unix_ns * 1e-9, 0.0)
-        print_pairs(_status_lines(found, identity, uptime_s))
+        print_pairs(_status_lines(found, identity))
     return DaemonUnreachable.exit_code if found.state == "dead" else 0
 
 
-def _state_text(found: Snapshot, pid: int, uptime_s: float) -> str:
+def _state_text(found: Snapshot, identity: DaemonIdentity) -> str:
+    pid, uptime = identity.pid, format_duration(uptime_s(identity))
     return {
-        "healthy": f"healthy, pid {pid}, up {format_duration(uptime_s)}",
-        "starting": f"starting, pid {pid}, for {format_duration(uptime_s)}: it does not listen yet",
+        "healthy": f"healthy, pid {pid}, up {uptime}",
+        "starting": f"starting, pid {pid}, for {uptime}: it does not listen yet",
         "stopped": f"PAUSED, pid {pid}: continue it with `kill -CONT {pid}`",
         "hung": f"HUNG, pid {pid}: no heartbeat for {format_duration(found.beat_age_s)}",
         "dead": f"DEAD: pid {pid} crashed or was killed; start it again, it keeps the cells in memory",
@@ -107,14 +108,14 @@ def _occasional_lines(count: Mapping[str, int]) -> list[tuple[str, str]]:
     return lines
 
 
-def _status_lines(found: Snapshot, identity: DaemonIdentity, uptime_s: float) -> list[tuple[str, str]]:
+def _status_lines(found: Snapshot, identity: DaemonIdentity) -> list[tuple[str, str]]:
     count = found.counters
     used = count["bytes_resident"] + count["bytes_zombie"] + count["bytes_reserved"]
     budget = count["budget_bytes"]
     share = f" ({100 * used / budget:.0f} %)" if budget else ""
     asked = count["hits"] + count["misses"]
     lines = [
-        ("daemon", _state_text(found, identity.pid, uptime_s)),
+        ("daemon", _state_text(found, identity)),
         ("instance", f"{identity.instance} (shmmap {identity.library_version})"),
         ("endpoint", identity.endpoint),
         ("map", f"{identity.map_path}, {count['map_cells']:,} cells, version {identity.map_version:016x}"),
