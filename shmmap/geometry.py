@@ -9,7 +9,7 @@ highest); None: all.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
 import msgspec
 import numpy as np
@@ -31,6 +31,9 @@ __all__ = [
     "distance_to_boxes",
     "heights_overlap",
 ]
+
+
+_R = TypeVar("_R", bound="_Round")
 
 
 def _finite(kind: str, **values: float) -> None:
@@ -70,14 +73,14 @@ def heights_overlap(z: tuple[float, float], z_min: float, z_max: float) -> bool:
     return not (z_max < z[0] or z_min > z[1])
 
 
-def _check_round(kind: str, area: Circle | AutowareSquare) -> None:
+def _check_round(kind: str, area: _Round) -> None:
     _finite(kind, x=area.x, y=area.y, radius=area.radius)
     if area.radius < 0:
         raise BadRequest(f"{kind}: radius must not be negative, it is {area.radius!r}")
     _check_z(area)
 
 
-def _check_z(area: Area) -> None:
+def _check_z(area: _Round | Box) -> None:
     if area.z is not None:
         msgspec.structs.force_setattr(area, "z", checked_heights(area.z))
 
@@ -87,13 +90,26 @@ def _inside(bounds: tuple[float, float, float, float], x: float, y: float, radiu
     return min_x <= x - radius and x + radius <= max_x and min_y <= y - radius and y + radius <= max_y
 
 
-class Circle(msgspec.Struct, frozen=True):
-    """True circle: a box belongs to it when its nearest point is within ``radius``."""
+class _Round(msgspec.Struct, frozen=True):
+    """A place, and a distance from it."""
 
     x: float
     y: float
     radius: float
     z: tuple[float, float] | None = None
+
+    @property
+    def center(self) -> tuple[float, float]:
+        """Point from which distance is measured."""
+        return self.x, self.y
+
+    def around(self: _R, x: float, y: float, wider_m: float = 0.0) -> _R:
+        """Return the same area around another place, wider by ``wider_m`` on each side."""
+        return type(self)(x, y, self.radius + wider_m, self.z)
+
+
+class Circle(_Round, frozen=True):
+    """True circle: a box belongs to it when its nearest point is within ``radius``."""
 
     def __post_init__(self) -> None:
         _check_round("circle", self)
@@ -104,18 +120,9 @@ class Circle(msgspec.Struct, frozen=True):
         return self.x - self.radius, self.y - self.radius, self.x + self.radius, self.y + self.radius
 
     @property
-    def center(self) -> tuple[float, float]:
-        """Point from which distance is measured."""
-        return self.x, self.y
-
-    @property
     def reach(self) -> float:
         """Distance of the area's farthest point from its centre, metres."""
         return self.radius
-
-    def around(self, x: float, y: float, wider_m: float = 0.0) -> Circle:
-        """Return the same area around another place, wider by ``wider_m`` on each side."""
-        return Circle(x, y, self.radius + wider_m, self.z)
 
     def contains_circle(self, x: float, y: float, radius: float) -> bool:
         """Return whether a circle lies wholly in this one, border included."""
@@ -129,7 +136,7 @@ class Circle(msgspec.Struct, frozen=True):
         return inside
 
 
-class AutowareSquare(msgspec.Struct, frozen=True):
+class AutowareSquare(_Round, frozen=True):
     """Autoware's area test, to the letter: a square of half-side ``radius``.
 
     Autoware calls it a cylinder, but its first clause (box grown by the radius, closed borders)
@@ -137,11 +144,6 @@ class AutowareSquare(msgspec.Struct, frozen=True):
     utils.cpp).  Centre, radius and boxes are rounded to float32 as in its messages; the
     arithmetic is double.
     """
-
-    x: float
-    y: float
-    radius: float
-    z: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         _check_round("square", self)
@@ -155,18 +157,9 @@ class AutowareSquare(msgspec.Struct, frozen=True):
         return x - radius, y - radius, x + radius, y + radius
 
     @property
-    def center(self) -> tuple[float, float]:
-        """Point from which distance is measured."""
-        return self.x, self.y
-
-    @property
     def reach(self) -> float:
         """Distance of the area's farthest point from its centre, metres."""
         return math.sqrt(2.0) * self.radius
-
-    def around(self, x: float, y: float, wider_m: float = 0.0) -> AutowareSquare:
-        """Return the same area around another place, wider by ``wider_m`` on each side."""
-        return AutowareSquare(x, y, self.radius + wider_m, self.z)
 
     def contains_circle(self, x: float, y: float, radius: float) -> bool:
         """Return whether a circle surely lies wholly in the square, allowing for float32 rounding."""

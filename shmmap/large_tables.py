@@ -100,11 +100,6 @@ class ShardedDict(MutableMapping[K, V]):
     def __len__(self) -> int:
         return sum(map(len, self._shards))
 
-    def __eq__(self, other: object) -> bool:
-        return dict(self) == (dict(other) if isinstance(other, ShardedDict) else other)
-
-    __hash__ = None  # type: ignore[assignment]
-
 
 SMALL_BYTES: Final = 1 << 21
 """Size below which numpy requests no huge pages, and a separate mapping is not worthwhile."""

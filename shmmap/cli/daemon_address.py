@@ -75,7 +75,7 @@ def locate(args: argparse.Namespace) -> tuple[str, str]:
     ProtocolMismatch
         The daemon at this socket is of another version, and no statistics name it.
     """
-    named, by_name = _named_socket(args), (instance(args), shm_dir(args))
+    named, by_name = endpoint(args) or "", (instance(args), shm_dir(args))
     if _is_at(*by_name, named if _endpoint_setting(args) or _setting(args, "runtime_dir") else ""):
         return by_name
     mismatch: ProtocolMismatch | None = None
@@ -97,12 +97,6 @@ def locate(args: argparse.Namespace) -> tuple[str, str]:
             hint="name that one with --endpoint or --instance",
         )
     return found or by_name
-
-
-def _named_socket(args: argparse.Namespace) -> str:
-    """Return the socket that the options name; empty if they name none."""
-    found = endpoint(args)
-    return found if found is not None else ""
 
 
 def _is_at(name: str, directory: str, socket: str) -> bool:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import importlib
 import inspect
 from typing import Annotated, Any, TypeAlias, get_type_hints
@@ -241,18 +240,10 @@ def json_schema(output: str) -> dict[str, Any]:
 
 def more_of(kind: type, **others: type) -> type[msgspec.Struct]:
     """Return a new struct type with the fields of a dataclass, struct or named tuple, and further fields."""
-    fields = {name: hint for name, hint in get_type_hints(kind).items() if name in _names(kind)}
-    return msgspec.defstruct(kind.__name__, list({**fields, **others}.items()))
+    return msgspec.defstruct(kind.__name__, list({**get_type_hints(kind), **others}.items()))
 
 
 def with_more(made: Any, **others: Any) -> msgspec.Struct:
     """Return a struct with all fields of ``made``, and further ones."""
     kind = more_of(type(made), **{name: type(value) for name, value in others.items()})
-    return kind(**{name: getattr(made, name) for name in _names(type(made))}, **others)
-
-
-def _names(kind: type) -> tuple[str, ...]:
-    for attribute in ("__struct_fields__", "_fields"):
-        if found := getattr(kind, attribute, None):
-            return tuple(found)
-    return tuple(field.name for field in dataclasses.fields(kind))
+    return kind(**{name: getattr(made, name) for name in get_type_hints(type(made))}, **others)

@@ -20,7 +20,7 @@ import time
 from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "FILTER",
-    "Comparison",
     "LiveDriveResult",
     "LiveDriveSettings",
     "UnboundedMap",
@@ -291,21 +290,6 @@ def _draw(endpoint: str, path: list[tuple[float, float, float]], work: Path) -> 
     return picture.read_text(encoding="utf-8")
 
 
-class Comparison(NamedTuple):
-    """Comparison of a live map with the unbounded one.
-
-    Attributes
-    ----------
-    voxels
-        Voxels known in at least one of the maps.
-    differing
-        Number of these voxels that differ.
-    """
-
-    voxels: int
-    differing: int
-
-
 class UnboundedMap:
     """Map without memory limit: stores the hits and misses of every scan in every chunk.
 
@@ -345,8 +329,15 @@ class UnboundedMap:
                 found[words[part]] = np.where(voxels[part] != 0, after, before)
         return found.reshape(CHUNK_VOXELS)
 
-    def compare(self, path: str) -> Comparison:
+    def compare(self, path: str) -> tuple[int, int]:
         """Compare with the files of a live map, voxel by voxel.
+
+        Returns
+        -------
+        voxels
+            Number of voxels known in at least one of the maps.
+        differing
+            Number of these voxels that differ.
 
         Raises
         ------
@@ -362,7 +353,7 @@ class UnboundedMap:
                 theirs = stored.chunk(key)[1].dense() if key in stored.chunks else nothing
                 voxels += int(np.count_nonzero(mine | theirs))
                 differing += int(np.count_nonzero(mine != theirs))
-        return Comparison(voxels, differing)
+        return voxels, differing
 
 
 def main(argv: list[str]) -> int:

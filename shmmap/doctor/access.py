@@ -9,6 +9,7 @@ import grp
 import json
 import os
 import pwd
+import re
 import stat
 import time
 from collections import Counter
@@ -16,7 +17,7 @@ from itertools import islice
 from typing import Any, Final
 
 from shmmap.daemon.prerequisites import account_name
-from shmmap.doctor.diagnosis import Diagnosis
+from shmmap.doctor.diagnosis import ANSWER_S, Diagnosis
 from shmmap.doctor.verdicts import Finding, fail, ok, outage_so_far, skip, warn
 from shmmap.errors import (
     DaemonUnreachable,
@@ -36,12 +37,12 @@ __all__ = [
     "check_map_access",
     "check_ros_bridge",
     "check_socket",
-    "drop_ins",
     "group_name",
     "groups_of",
+    "is_in",
+    "paths_of_service",
 ]
 
-ANSWER_S: Final = 2.0
 LOOKED_AT: Final = 256
 """Files of a map whose permissions are checked; those of one map rarely differ."""
 _UNITS: Final = "/etc/systemd/system"
@@ -66,7 +67,6 @@ def groups_of(uid: int) -> set[int]:
 
 def check_group(diagnosis: Diagnosis) -> Finding:
     """Check that this account is a member of the group that may connect."""
-    name = "group"
     gid = -1
     if diagnosis.config.group.isdigit():
         gid = int(diagnosis.config.group)
@@ -75,7 +75,6 @@ def check_group(diagnosis: Diagnosis) -> Finding:
             gid = grp.getgrnam(diagnosis.config.group).gr_gid
         except KeyError:
             return fail(
-                name,
                 f"there is no group {diagnosis.config.group!r}",
                 f"groupadd --system {diagnosis.config.group}",
             )
@@ -86,20 +85,18 @@ def check_group(diagnosis: Diagnosis) -> Finding:
         except OSError:
             pass
     if gid < 0:
-        return ok(name, "none is set: only the daemon's own user may connect")
+        return ok("none is set: only the daemon's own user may connect")
     group, account = group_name(gid), account_name(diagnosis.uid)
     if diagnosis.uid in (0, diagnosis.runs_as):
-        return ok(name, f"members of {group} may connect; {account} may anyway")
+        return ok(f"members of {group} may connect; {account} may anyway")
     if gid in (os.getegid(), *os.getgroups()):
-        return ok(name, f"{account} is a member of {group}")
+        return ok(f"{account} is a member of {group}")
     if gid in groups_of(diagnosis.uid):
         return warn(
-            name,
             f"{account} joined {group}, this session is older",
             "log in again, or `newgrp " + group + "`",
         )
     return fail(
-        name,
         f"{account} is not a member of {group}",
         f"sudo usermod -aG {group} {account}, then log in again",
     )
@@ -109,28 +106,28 @@ def check_socket(diagnosis: Diagnosis) -> Finding:
     """Check that the daemon answers, and report which accounts may connect."""
     from shmmap.client.discovery import check_socket as connect
 
-    name, path = "socket", diagnosis.socket
+    path = diagnosis.socket
     if diagnosis.awaits_first_client:
-        return ok(name, f"{path} waits for the first client: {_access(path)}")
+        return ok(f"{path} waits for the first client: {_access(path)}")
     try:
         connect(path, time.monotonic() + ANSWER_S)
     except NoSocket as error:
         if why := _closed_place(diagnosis):
-            return fail(name, why, "see whose it is and remove it, or set XDG_RUNTIME_DIR, or runtime_dir")
-        return warn(name, error.message, "start it: `systemctl start shmmapd` or `shmmap serve MAP`")
+            return fail(why, "see whose it is and remove it, or set XDG_RUNTIME_DIR, or runtime_dir")
+        return warn(error.message, "start it: `systemctl start shmmapd` or `shmmap serve MAP`")
     except SocketPermission as error:
-        return fail(name, f"{error.message}: {_access(path)}", error.hint)
+        return fail(f"{error.message}: {_access(path)}", error.hint)
     except (NoAnswer, DaemonUnreachable, ProtocolMismatch) as error:
-        return fail(name, error.message, error.hint)
+        return fail(error.message, error.hint)
     try:
         open_to_all = os.stat(path).st_mode & stat.S_IWOTH
         above = os.stat(os.path.dirname(path)).st_mode & stat.S_IXOTH
     except OSError as error:
-        return warn(name, f"{path}: {error.strerror}", "is it being restarted?")
+        return warn(f"{path}: {error.strerror}", "is it being restarted?")
     fact = f"{path} answers: {_access(path)}"
     if open_to_all and above:
-        return warn(name, fact, f"every account may connect: chmod o-rwx {path}")
-    return ok(name, fact)
+        return warn(fact, f"every account may connect: chmod o-rwx {path}")
+    return ok(fact)
 
 
 def _closed_place(diagnosis: Diagnosis) -> str:
@@ -154,45 +151,41 @@ def _access(path: str) -> str:
 
 def check_map_access(diagnosis: Diagnosis) -> Finding:
     """Check that the daemon can read the map, whether a directory or a URL."""
-    name, path = "map", diagnosis.map_path
+    path = diagnosis.map_path
     if not path and (diagnosis.config.live or (diagnosis.seen is not None and diagnosis.seen.live)):
-        return ok(name, "none is served: the daemon keeps live maps alone")
+        return ok("none is served: the daemon keeps live maps alone")
     if not path:
-        return warn(name, "no map is named", "set map_path, or give `shmmap serve MAP`")
+        return warn("no map is named", "set map_path, or give `shmmap serve MAP`")
     if diagnosis.alive:
         if diagnosis.counters.get("origin_out", 0):
             since = outage_so_far(diagnosis.counters)
             return warn(
-                name,
                 f"{path} is being served from memory: where it comes from has not answered for {since}",
                 "`shmmap tail` says why loads fail",
             )
         if problems := diagnosis.counters.get("map_problems", 0):
             return warn(
-                name,
                 f"{path} is being served, but reading it found {counted(problems, 'problem')}",
                 "the daemon's log names them, and so does `shmmap reload`",
             )
         if outside := diagnosis.counters.get("cells_outside_box", 0):
             return warn(
-                name,
                 f"{path} is being served, but points of {counted(outside, 'cell')} lie outside its box",
                 "moved without the metadata? the daemon's log names them, and so does `shmmap inspect`",
             )
-        return ok(name, f"{path} is being served")
+        return ok(f"{path} is being served")
     if is_url(path):
-        return ok(name, f"{path} is looked for when the daemon starts")
+        return ok(f"{path} is looked for when the daemon starts")
     if not os.path.exists(path):
         try:
             os.stat(path)
         except PermissionError:
-            return warn(name, f"{path}: this user may not look there", "run it with sudo")
+            return warn(f"{path}: this user may not look there", "run it with sudo")
         except OSError:
-            return fail(name, f"there is no map at {path}", "set map_path")
+            return fail(f"there is no map at {path}", "set map_path")
     uid = diagnosis.runs_as
     if uid != diagnosis.uid and _hidden_from_service(diagnosis, path):
         return fail(
-            name,
             f"{path} lies where the service sees nothing (ProtectHome=, PrivateTmp=)",
             f"sudo shmmap unit install --map {path}, or see `shmmap unit print drop-ins/maps-in-home.conf`",
         )
@@ -200,30 +193,31 @@ def check_map_access(diagnosis: Diagnosis) -> Finding:
     closed = _closed_to(uid, path, parents=not shown)
     if closed:
         return fail(
-            name,
             f"{account_name(uid)} may not read {closed}",
             f"chmod -R a+rX {path}, and a+x on what is above it",
         )
-    return ok(name, f"{path} can be read by {account_name(uid)}")
+    return ok(f"{path} can be read by {account_name(uid)}")
 
 
-def drop_ins(diagnosis: Diagnosis) -> str:
-    """Return the drop-in files of the service's unit."""
+def paths_of_service(diagnosis: Diagnosis, *settings: str) -> list[str]:
+    """Return the paths that drop-ins of the service's unit name in any of these settings."""
     directory = diagnosis.machine.path(f"{_UNITS}/shmmapd.service.d")
     try:
-        return "\n".join(one.read_text(errors="replace") for one in sorted(directory.glob("*.conf")))
+        text = "\n".join(one.read_text(errors="replace") for one in sorted(directory.glob("*.conf")))
     except OSError:
-        return ""
+        return []
+    named = re.findall(rf"^(?:{'|'.join(settings)})=(.*)$", text, re.MULTILINE)
+    return [word.strip('"-+').split(":")[0] for word in " ".join(named).split()]
+
+
+def is_in(path: str, directory: str) -> bool:
+    """Return whether a path lies in a directory, or is that directory."""
+    return f"{path}/".startswith(f"{directory.rstrip('/')}/")
 
 
 def _shown_to_service(diagnosis: Diagnosis, path: str) -> bool:
-    shown = [
-        word.split(":")[0].strip('"')
-        for line in drop_ins(diagnosis).splitlines()
-        if line.startswith(("BindReadOnlyPaths=", "BindPaths="))
-        for word in line.split("=", 1)[1].split()
-    ]
-    return any(path == place or path.startswith(place.rstrip("/") + "/") for place in shown)
+    shown = paths_of_service(diagnosis, "BindReadOnlyPaths", "BindPaths")
+    return any(is_in(path, place) for place in shown)
 
 
 def _hidden_from_service(diagnosis: Diagnosis, path: str) -> bool:
@@ -272,10 +266,9 @@ def check_ros_bridge(diagnosis: Diagnosis) -> Finding:
     A bridge writes its status to a file beside the daemon's socket, ``INSTANCE.ros-bridge-DOMAIN.json``, and
     holds a lock on that file while it runs.
     """
-    name = "ROS bridge"
     bridges = [one for path in _files(diagnosis) if (one := _read_status(diagnosis, path)) is not None]
     if not bridges:
-        return skip(name, "none runs")
+        return skip("none runs")
     places = ", ".join(
         sorted(f"domain {one['domain']}: {counted(one['clients'], 'client')}" for one in bridges)
     )
@@ -285,14 +278,13 @@ def check_ros_bridge(diagnosis: Diagnosis) -> Finding:
         for one in each["incompatible"]
     )
     if not unanswered:
-        return ok(name, places)
+        return ok(places)
     named = "; ".join(
         f"{counted(count, 'client')} of {service}{f', of {vendor}' if vendor else ''}"
         for (service, vendor), count in unanswered.most_common(_NAMED)
     )
     more = "; …" if len(unanswered) > _NAMED else ""
     return warn(
-        name,
         f"{places}; not nodes of rmw_cyclonedds_cpp, so that they never get an answer: {named}{more}",
         _BRIDGE_ADVICE,
     )

@@ -7,14 +7,13 @@ import math
 import time
 from typing import Final
 
-from shmmap.doctor.diagnosis import Diagnosis
-from shmmap.doctor.verdicts import Finding, cache_verdict, fail, ok, outage_so_far, skip, warn
+from shmmap.doctor.diagnosis import ANSWER_S, Diagnosis
+from shmmap.doctor.verdicts import Finding, cache_verdict, fail, ok, outage_so_far, warn
 from shmmap.errors import ShmmapError
 from shmmap.quantities import counted, format_bytes, format_duration
 
 __all__ = ["check_cache", "check_cells", "check_prefetching"]
 
-ANSWER_S: Final = 2.0
 SHORT: Final = ("out of memory", "of memory that a loader may use")
 """Texts in messages of loads that failed for lack of memory."""
 NAMED: Final = 3
@@ -25,38 +24,32 @@ MAX_MISS_SHARE: Final = 0.02
 
 def check_cells(diagnosis: Diagnosis) -> Finding:
     """Check that every requested cell can be loaded."""
-    name = "cells"
-    if not diagnosis.alive or diagnosis.seen is None:
-        return skip(name, "no daemon runs")
     failures = diagnosis.counters.get("loads_failed", 0)
     if not failures:
-        return ok(name, "no load has failed")
+        return ok("no load has failed")
     since = f"{counted(failures, 'load')} failed since the start"
-    if diagnosis.seen.state != "healthy":
-        return warn(name, since, "`shmmap tail` names the cells once the daemon answers; so does its log")
+    if diagnosis.state != "healthy":
+        return warn(since, "`shmmap tail` names the cells once the daemon answers; so does its log")
     try:
         failing = _failing(diagnosis)
     except ShmmapError as error:
-        return warn(name, f"{since}; the daemon was not asked which: {error.message}", "its log says which")
+        return warn(f"{since}; the daemon was not asked which: {error.message}", "its log says which")
     if not failing:
-        return ok(name, f"{since}; no cell is known to fail now")
+        return ok(f"{since}; no cell is known to fail now")
     causes = "; ".join(_cause(*one, failing[one]) for one in list(failing)[:NAMED])
     more = f"; and {len(failing) - NAMED:,} more" if len(failing) > NAMED else ""
     fact = f"{counted(len({cell for cell, _ in failing}), 'cell')} cannot be loaded: {causes}{more}"
     blamed = [cell for (cell, _), message in failing.items() if not any(map(message.__contains__, SHORT))]
     if not blamed:
         return warn(
-            name,
             fact,
             "the files are not to blame: give the daemon more memory (MemoryMax=, docker --memory), or divide"
             " the map into smaller cells",
         )
     if diagnosis.counters.get("origin_out", 0):
-        return warn(name, fact, "they are loaded once the map's origin answers again: see the row `map`")
-    prefix = diagnosis.seen.identity.id_prefix if diagnosis.seen.identity is not None else ""
-    return warn(
-        name, fact, f"`shmmap inspect {prefix}{blamed[0]}` reads the file and says what is wrong with it"
-    )
+        return warn(fact, "they are loaded once the map's origin answers again: see the row `map`")
+    prefix = diagnosis.identity.id_prefix if diagnosis.identity is not None else ""
+    return warn(fact, f"`shmmap inspect {prefix}{blamed[0]}` reads the file and says what is wrong with it")
 
 
 def _cause(cell: str, layer: str, message: str) -> str:
@@ -76,8 +69,7 @@ def _failing(diagnosis: Diagnosis) -> dict[tuple[str, str], str]:
     from shmmap.client.event_stream import EventStream
     from shmmap.protocol.events import Changed, Failed, Loaded
 
-    identity = diagnosis.seen.identity if diagnosis.seen is not None else None
-    started_s = identity.started_unix_ns * 1e-9 if identity is not None else 0.0
+    started_s = diagnosis.identity.started_unix_ns * 1e-9 if diagnosis.identity is not None else 0.0
     since_s = max(time.time() - started_s, 0.0) + 1.0
     failing: dict[tuple[str, str], str] = {}
     with EventStream(diagnosis.socket, since=since_s, name="shmmap doctor", timeout=ANSWER_S) as stream:
@@ -93,56 +85,47 @@ def _failing(diagnosis: Diagnosis) -> dict[tuple[str, str], str]:
 
 def check_cache(diagnosis: Diagnosis) -> Finding:
     """Check that the budget is large enough for the clients, by the same rule as ``status``."""
-    name = "cache size"
-    if not diagnosis.alive:
-        return skip(name, "no daemon runs")
     verdict = cache_verdict(diagnosis.counters)
     if diagnosis.counters.get("refused_over_budget_1min", 0):
-        return fail(name, verdict.text, verdict.hint)
-    return warn(name, verdict.text, verdict.hint) if verdict.too_small else ok(name, verdict.text)
+        return fail(verdict.text, verdict.hint)
+    return warn(verdict.text, verdict.hint) if verdict.too_small else ok(verdict.text)
 
 
 def check_prefetching(diagnosis: Diagnosis) -> Finding:
     """Check that moving clients find their cells in memory, by the counters of the last ten minutes."""
-    name = "prefetching"
-    if not diagnosis.alive:
-        return skip(name, "no daemon runs")
     count = diagnosis.counters
     misses = count.get("prefetch_misses_10min", 0)
     waited = (
         f"moving clients waited for {counted(misses, 'cell') if misses else 'no cell'} in the last 10 min"
     )
     if not count.get("prefetch_budget_bytes", 0):
-        return ok(name, f"off; {waited}", "raise --prefetch-share" if misses else "")
+        return ok(f"off; {waited}", "raise --prefetch-share" if misses else "")
     if count.get("origin_out", 0):
         return warn(
-            name,
             f"the map's storage is out of reach: no load has succeeded for {outage_so_far(count)}; {waited}",
             "see to its disk or network; `shmmap tail` says why loads fail",
         )
     outage_s = count.get("last_outage_ns", 0) * 1e-9
     if misses and outage_s > count.get("outage_tolerance_ns", 0) * 1e-9:
         return warn(
-            name,
             f"{waited}; the map's storage was out of reach for {format_duration(outage_s)}, longer than"
             " --outage-tolerance",
             f"raise --outage-tolerance ({math.ceil(outage_s)})",
         )
     asked = count.get("hits_10min", 0) + count.get("misses_10min", 0)
     if misses <= MAX_MISS_SHARE * asked:
-        return ok(name, waited)
+        return ok(waited)
     smaller = "give the clients a smaller radius or a layer with fewer bytes"
     short = count.get("prefetch_short", 0)
     if short == 1:
         share = format_bytes(count["prefetch_budget_bytes"])
         fact = f"{waited}; cells fetched ahead take all of their share, {share}"
-        return warn(name, fact, f"raise --prefetch-share or --budget, or {smaller}")
+        return warn(fact, f"raise --prefetch-share or --budget, or {smaller}")
     if short == 2:
         budget = format_bytes(count.get("budget_bytes", 0))
         fact = f"{waited}; the budget of {budget} is full of what is in use or needed sooner"
-        return warn(name, fact, f"raise --budget, or {smaller}")
+        return warn(fact, f"raise --budget, or {smaller}")
     return warn(
-        name,
         waited,
         "give the daemon more --workers, and have clients send their route (MapWindow.move_to(route=...)):"
         " without one the daemon cannot know where they turn",

@@ -35,7 +35,7 @@ from shmmap.doctor.published import (
     check_signature,
     check_versions,
 )
-from shmmap.doctor.verdicts import Finding
+from shmmap.doctor.verdicts import Finding, skip
 from shmmap.errors import ShmmapError
 from shmmap.segment.directory import DEFAULT_SHM_DIR
 from shmmap.segment.names import usual_directory
@@ -43,34 +43,36 @@ from shmmap.statistics.reader import read_statistics
 
 __all__ = ["CHECKS", "diagnose", "examine"]
 
-CHECKS: Final[tuple[Callable[[Diagnosis], Finding], ...]] = (  # in the order of the output
-    check_daemon,
-    check_socket,
-    check_group,
-    check_map_access,
-    check_link,
-    check_credentials,
-    check_clock,
-    check_versions,
-    check_reload,
-    check_signature,
-    check_cells,
-    check_shared_memory,
-    check_cache,
-    check_prefetching,
-    check_memory_limit,
-    check_container,
-    check_huge_pages,
-    check_disk_cache,
-    check_live_maps,
-    check_live_disk,
-    check_live_memory,
-    check_ros_bridge,
-    check_pins,
-    check_descriptors,
-    check_leftovers,
-    check_logind,
-)
+CHECKS: Final[dict[str, Callable[[Diagnosis], Finding]]] = {  # in the order of the output
+    "daemon": check_daemon,
+    "socket": check_socket,
+    "group": check_group,
+    "map": check_map_access,
+    "link": check_link,
+    "credentials": check_credentials,
+    "clock": check_clock,
+    "versions": check_versions,
+    "reload": check_reload,
+    "signature": check_signature,
+    "cells": check_cells,
+    "shared memory": check_shared_memory,
+    "cache size": check_cache,
+    "prefetching": check_prefetching,
+    "memory limit": check_memory_limit,
+    "container": check_container,
+    "huge pages": check_huge_pages,
+    "disk cache": check_disk_cache,
+    "live maps": check_live_maps,
+    "live disk": check_live_disk,
+    "live memory": check_live_memory,
+    "ROS bridge": check_ros_bridge,
+    "leases": check_pins,
+    "open files": check_descriptors,
+    "leftovers": check_leftovers,
+    "logout": check_logind,
+}
+_OF_A_DAEMON: Final = frozenset({"reload", "signature", "cells", "cache size", "prefetching"})
+_OF_A_PUBLISHED_MAP: Final = frozenset({"link", "credentials", "clock", "versions"})
 
 
 def examine(config: DaemonConfig, file: str, machine: Machine | None = None) -> Diagnosis:
@@ -94,8 +96,17 @@ def examine(config: DaemonConfig, file: str, machine: Machine | None = None) -> 
 
 
 def diagnose(diagnosis: Diagnosis) -> list[Finding]:
-    """Run all checks."""
-    return [check(diagnosis) for check in CHECKS]
+    """Run all checks that apply."""
+    findings = []
+    for name, check in CHECKS.items():
+        if name in _OF_A_DAEMON and not diagnosis.alive:
+            found = skip("no daemon runs")
+        elif name in _OF_A_PUBLISHED_MAP and not diagnosis.is_published:
+            found = skip("the map is files")
+        else:
+            found = check(diagnosis)
+        findings.append(dataclasses.replace(found, name=name))
+    return findings
 
 
 def _socket(config: DaemonConfig) -> str:

@@ -13,7 +13,7 @@ from typing import Final
 from shmmap.daemon.pins.probe import probe_pins
 from shmmap.daemon.prerequisites import account_name
 from shmmap.doctor.diagnosis import Diagnosis, Machine, answering_at
-from shmmap.doctor.verdicts import Finding, fail, ok, skip, warn
+from shmmap.doctor.verdicts import Finding, fail, ok, warn
 from shmmap.errors import CannotStart, ShmmapError
 from shmmap.quantities import counted, format_bytes
 from shmmap.segment.directory import ShmDirectory
@@ -39,58 +39,50 @@ _CHUNK: Final = re.compile(r"shmmap-live\.([A-Za-z0-9_-]{1,64})\.[A-Za-z0-9_-]{1
 
 def check_daemon(diagnosis: Diagnosis) -> Finding:
     """Check that the daemon runs, answers and matches the installed version."""
-    name = "daemon"
     if diagnosis.seen is None:
-        return warn(name, diagnosis.unreadable, "join its group, or run it with sudo")
+        return warn(diagnosis.unreadable, "join its group, or run it with sudo")
     identity, state = diagnosis.seen.identity, diagnosis.seen.state
     instance = diagnosis.config.instance
     if diagnosis.awaits_first_client:
-        return ok(name, f"instance {instance} does not run; its first client starts it")
+        return ok(f"instance {instance} does not run; its first client starts it")
     if identity is None and diagnosis.answering:
         return warn(
-            name,
             f"instance {instance}, pid {diagnosis.answering}, answers, but its statistics were removed",
             "it makes them again within seconds, or its log says why not",
         )
     if identity is None:
-        return warn(
-            name, f"instance {instance} does not run", "`systemctl start shmmapd` or `shmmap serve MAP`"
-        )
+        return warn(f"instance {instance} does not run", "`systemctl start shmmapd` or `shmmap serve MAP`")
     shown = {"stopped": "paused (SIGSTOP or a debugger)"}.get(state, state)
     fact = f"instance {instance}, pid {identity.pid}, is {shown}"
     if state == "dead":
         return fail(
-            name, f"{fact}: it crashed or was killed", "start it again: it keeps the cells that are in memory"
+            f"{fact}: it crashed or was killed", "start it again: it keeps the cells that are in memory"
         )
     if state == "stopped":
-        return fail(name, fact, f"continue it: kill -CONT {identity.pid}")
+        return fail(fact, f"continue it: kill -CONT {identity.pid}")
     if state == "starting":
-        return warn(name, fact, "wait until it listens: kernels are compiled the first time")
+        return warn(fact, "wait until it listens: kernels are compiled the first time")
     if state == "hung":
         return fail(
-            name,
             fact,
             "if its log says that it cannot write its statistics, lift that limit; else the watchdog ends it"
             f" under systemd, elsewhere kill -ABRT {identity.pid}",
         )
     if defects := diagnosis.seen.counters.get("defects", 0):
         return warn(
-            name,
             f"{fact}; it survived {counted(defects, 'exception')}",
             "please report the tracebacks in its log: journalctl -u shmmapd -g defect",
         )
     if identity.library_version != __version__:
         return warn(
-            name,
             f"{fact}; it is version {identity.library_version}, installed is {__version__}",
             "restart it (cells stay in memory): systemctl restart shmmapd",
         )
-    return ok(name, fact)
+    return ok(fact)
 
 
 def check_leftovers(diagnosis: Diagnosis) -> Finding:
     """Check for memory in segments that belong to no running daemon."""
-    name = "leftovers"
     found: dict[str, tuple[int, int]] = {}
     with_chunks: set[str] = set()
     try:
@@ -105,7 +97,7 @@ def check_leftovers(diagnosis: Diagnosis) -> Finding:
                         found[match[1]] = (count + 1, nbytes + held)
                         with_chunks |= {match[1]} if chunk else set()
     except OSError as error:
-        return warn(name, f"{diagnosis.shm_dir}: {error.strerror}", "run it with sudo")
+        return warn(f"{diagnosis.shm_dir}: {error.strerror}", "run it with sudo")
     orphans = {name: held for name, held in found.items() if not _has_daemon(diagnosis, name)}
     listening = diagnosis.listening if orphans else set()
     silent = ""
@@ -116,25 +108,22 @@ def check_leftovers(diagnosis: Diagnosis) -> Finding:
             for instance in answer:
                 orphans.pop(instance, None)
     if not orphans:
-        return ok(name, "every segment belongs to a running daemon" if found else "none")
+        return ok("every segment belongs to a running daemon" if found else "none")
     listed = ", ".join(
         f"{one}: {counted(count, 'segment')}, {format_bytes(n)}"
         for one, (count, n) in sorted(orphans.items())
     )
     if with_chunks & set(orphans):
         return warn(
-            name,
             f"segments and chunks of live maps of daemons that do not run: {listed}",
             "start that instance with its live maps: chunks may be in memory alone, and are saved then",
         )
     if silent:
         return warn(
-            name,
             f"segments of daemons without statistics: {listed}",
             f"a daemon at {silent} does not answer this user, and they may be its: see `shmmap health`",
         )
     return warn(
-        name,
         f"segments of daemons that do not run: {listed}",
         "start that instance: it serves or frees them; or `rm " + diagnosis.shm_dir + "/shmmap.INSTANCE.*`",
     )
@@ -168,18 +157,17 @@ def _logind_setting(machine: Machine, key: str) -> str:
 
 def check_logind(diagnosis: Diagnosis) -> Finding:
     """Check whether the session manager will delete the segments at logout."""
-    name, machine, uid = "logout", diagnosis.machine, diagnosis.runs_as
+    machine, uid = diagnosis.machine, diagnosis.runs_as
     if uid <= SYSTEM_UIDS:
-        return ok(name, "the daemon runs as a system account: logind does not delete its segments")
+        return ok("the daemon runs as a system account: logind does not delete its segments")
     if not machine.path("/run/systemd/system").exists():
-        return ok(name, "no systemd here: nothing is deleted at logout")
+        return ok("no systemd here: nothing is deleted at logout")
     if _logind_setting(machine, "RemoveIPC").lower() in ("no", "0", "false", "off"):
-        return ok(name, "logind has RemoveIPC=no: segments outlive sessions")
+        return ok("logind has RemoveIPC=no: segments outlive sessions")
     account = account_name(uid)
     if machine.path(f"/var/lib/systemd/linger/{account}").exists():
-        return ok(name, f"{account} lingers: segments outlive sessions")
+        return ok(f"{account} lingers: segments outlive sessions")
     return warn(
-        name,
         f"logind deletes the segments of {account} a few seconds after the last logout",
         f"loginctl enable-linger {account}, or install the system service",
     )
@@ -187,9 +175,6 @@ def check_logind(diagnosis: Diagnosis) -> Finding:
 
 def check_reload(diagnosis: Diagnosis) -> Finding:
     """Check that the last attempt to read the map succeeded."""
-    name = "reload"
-    if not diagnosis.alive:
-        return skip(name, "no daemon runs")
     count = diagnosis.counters
     at_ns = count.get("last_reload_unix_ns", 0)
     at = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(at_ns * 1e-9)) if at_ns else ""
@@ -201,11 +186,10 @@ def check_reload(diagnosis: Diagnosis) -> Finding:
         fact = "the map was read once, at the start" + (at and f" ({at})")
     if count.get("last_reload_failed", 0):
         return fail(
-            name,
             f"{fact}; the last attempt failed, the map read before is served",
             "`shmmap reload` says why",
         )
-    return ok(name, fact)
+    return ok(fact)
 
 
 FEW_DESCRIPTORS: Final = 4096
@@ -214,31 +198,28 @@ _LIMIT: Final = re.compile(r"^Max open files\s+(\S+)\s+(\S+)", re.MULTILINE)
 
 def check_pins(diagnosis: Diagnosis) -> Finding:
     """Check that the kernel can report whether any process maps a segment."""
-    name = "leases"
     try:
         directory = ShmDirectory(diagnosis.shm_dir)
     except CannotStart as error:
         if diagnosis.alive:
-            return ok(name, "tried by the daemon when it started: see `shmmap status`")
-        return fail(name, error.message, error.hint)
+            return ok("tried by the daemon when it started: see `shmmap status`")
+        return fail(error.message, error.hint)
     try:
         found = probe_pins(directory)
     finally:
         directory.close()
     if not found.leases:
         return warn(
-            name,
             f"{diagnosis.shm_dir} grants none: memory in use is known from {found.source.value} only",
             "name a directory on a tmpfs with shm_dir",
         )
     parts = {"locks": found.locks, "inotify": found.close_events}
     if lacking := ", ".join(f"no {part}" for part, works in parts.items() if not works):
         return warn(
-            name,
             f"they work, but not all of what goes with them: {lacking}",
             "clients may stay unnamed, or memory be freed late: use a newer kernel",
         )
-    return ok(name, "leases and locks work: the kernel reports which processes map a segment")
+    return ok("leases and locks work: the kernel reports which processes map a segment")
 
 
 def check_descriptors(diagnosis: Diagnosis) -> Finding:
@@ -247,8 +228,8 @@ def check_descriptors(diagnosis: Diagnosis) -> Finding:
     hard = limits[2] if limits else str(resource.getrlimit(resource.RLIMIT_NOFILE)[1])
     whose = f"of the daemon (pid {diagnosis.pid})" if limits else "here"
     if not hard.isdigit() or int(hard) < 0:
-        return ok("open files", f"no limit {whose}")
+        return ok(f"no limit {whose}")
     fact = f"limit {whose}: {hard}, enough for {int(hard) // 2} clients"
     if int(hard) < FEW_DESCRIPTORS:
-        return warn("open files", fact, "raise it: LimitNOFILE=65536 in the unit, or `ulimit -Hn`")
-    return ok("open files", fact)
+        return warn(fact, "raise it: LimitNOFILE=65536 in the unit, or `ulimit -Hn`")
+    return ok(fact)

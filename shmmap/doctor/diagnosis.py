@@ -14,10 +14,14 @@ from typing import Final
 from shmmap.daemon.config import DaemonConfig
 from shmmap.doctor.store_probe import StoreAnswer, StoreQuestion, ask_store
 from shmmap.errors import ShmmapError
+from shmmap.origin.remote.store import is_published, is_url
 from shmmap.statistics.identity import DaemonIdentity
 from shmmap.statistics.snapshot import Snapshot
 
-__all__ = ["Diagnosis", "Machine", "answering_at"]
+__all__ = ["ANSWER_S", "Diagnosis", "Machine", "answering_at"]
+
+ANSWER_S: Final = 2.0
+"""Seconds that a check waits for the daemon's answer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,13 +64,19 @@ class Diagnosis:
         return self.seen.counters if self.seen is not None and self.alive else {}
 
     @property
-    def _identity(self) -> DaemonIdentity | None:
+    def identity(self) -> DaemonIdentity | None:
+        """Identity of the running daemon; None if none runs."""
         return self.seen.identity if self.seen is not None and self.alive else None
 
     @property
     def alive(self) -> bool:
         """Whether the daemon's process exists."""
-        return self.seen is not None and self.seen.state in ("healthy", "starting", "stopped", "hung")
+        return self.state in ("healthy", "starting", "stopped", "hung")
+
+    @property
+    def state(self) -> str:
+        """State of the daemon by its statistics; empty if they are unreadable."""
+        return self.seen.state if self.seen is not None else ""
 
     @property
     def awaits_first_client(self) -> bool:
@@ -87,14 +97,18 @@ class Diagnosis:
     @property
     def shm_dir(self) -> str:
         """Directory of the segments."""
-        identity = self._identity
-        return (identity.shm_dir if identity else "") or self.config.shm_dir
+        return (self.identity.shm_dir if self.identity else "") or self.config.shm_dir
 
     @property
     def map_path(self) -> str:
         """Path of the map that is served, or is configured."""
-        identity = self._identity
-        return (identity.map_path if identity else "") or self.config.map_path
+        return (self.identity.map_path if self.identity else "") or self.config.map_path
+
+    @property
+    def is_published(self) -> bool:
+        """Whether the map is a published one."""
+        path = self.map_path
+        return bool(path) and is_published(path if is_url(path) else str(self.machine.path(path)))
 
     @property
     def budget_bytes(self) -> int:
@@ -104,7 +118,7 @@ class Diagnosis:
     @property
     def pid(self) -> int:
         """Process id of the daemon; 0 if none runs or it is in another pid namespace."""
-        pid = self._identity.pid if self._identity else 0
+        pid = self.identity.pid if self.identity else 0
         return pid if pid and self.machine.path(f"/proc/{pid}").exists() else 0
 
     @cached_property
@@ -148,7 +162,6 @@ class Diagnosis:
         return self.uid
 
 
-ASKED_S: Final = 2.0
 _UNIT: Final = "/etc/systemd/system/shmmapd.service"
 _LISTENS: Final = 1 << 16  # __SO_ACCEPTCON of linux/net.h
 
@@ -161,7 +174,7 @@ def answering_at(path: str) -> dict[str, int]:
     if not is_served(path):
         return {}
     try:
-        with connect(path, timeout=ASKED_S, connect_timeout=ASKED_S, name="shmmap doctor") as client:
+        with connect(path, timeout=ANSWER_S, connect_timeout=ANSWER_S, name="shmmap doctor") as client:
             return {client.welcome.instance: client.welcome.pid}
     except ShmmapError:
         return {}

@@ -12,8 +12,8 @@ from typing import Final
 
 from shmmap.daemon.config_live import SERVICE_STATE, live_directory
 from shmmap.daemon.prerequisites import account_name
-from shmmap.doctor.access import drop_ins, group_name, groups_of
-from shmmap.doctor.diagnosis import Diagnosis
+from shmmap.doctor.access import group_name, groups_of, is_in, paths_of_service
+from shmmap.doctor.diagnosis import ANSWER_S, Diagnosis
 from shmmap.doctor.memory import mount_of
 from shmmap.doctor.verdicts import Finding, fail, ok, skip, warn
 from shmmap.errors import ConfigError, ShmmapError
@@ -23,7 +23,6 @@ from shmmap.segment.directory import DEFAULT_SHM_DIR
 
 __all__ = ["check_live_disk", "check_live_maps", "check_live_memory"]
 
-ANSWER_S: Final = 2.0
 NAMED: Final = 3
 """Problems and readers that are listed, at most."""
 OPEN: Final = 8
@@ -43,7 +42,7 @@ def _reported(diagnosis: Diagnosis) -> tuple[LiveMapRow, ...]:
     """Return the daemon's report on its live maps; empty if it does not answer."""
     from shmmap.client.client import connect
 
-    if diagnosis.seen is None or diagnosis.seen.state != "healthy" or not _rows(diagnosis):
+    if diagnosis.state != "healthy" or not _rows(diagnosis):
         return ()
     try:
         with connect(
@@ -59,16 +58,15 @@ def _reported(diagnosis: Diagnosis) -> tuple[LiveMapRow, ...]:
 
 def check_live_maps(diagnosis: Diagnosis) -> Finding:
     """Check that every chunk can be loaded and saved, and that none is lost."""
-    name, rows = "live maps", _rows(diagnosis)
+    rows = _rows(diagnosis)
     if not rows:
         running = "this daemon keeps none" if diagnosis.alive else "no daemon runs"
-        return skip(name, running if diagnosis.alive or diagnosis.config.live else "none are set up")
+        return skip(running if diagnosis.alive or diagnosis.config.live else "none are set up")
     unsaved = sum(row.unsaved for row in rows)
     fact = f"{', '.join(row.name for row in rows)}: {counted(unsaved, 'chunk')} not saved yet"
     if failing := [row for row in rows if row.problem]:
         what = "; ".join(f"{row.name}: {row.problem}" for row in failing)
         return fail(
-            name,
             what,
             "see to its files and its disk: it is tried again, and what is in memory stays there meanwhile",
         )
@@ -76,17 +74,15 @@ def check_live_maps(diagnosis: Diagnosis) -> Finding:
         texts = [f"{row.name}: {text}" for row in _reported(diagnosis) for text in row.damaged][:NAMED]
         named = f" ({'; '.join(texts)}{'; …' if damaged > NAMED else ''})" if texts else ""
         return warn(
-            name,
             f"damaged files, missing chunks: {damaged:,}{named}",
             "damaged files are in quarantine; stop the daemon, then `shmmap live fsck` says what is left",
         )
     if restarts := diagnosis.counters.get("live_restarts", 0):
         return warn(
-            name,
             f"{fact}; the process that keeps them ended {counted(restarts, 'time')}",
             "please report what its log says: journalctl -u shmmapd -g live",
         )
-    return ok(name, fact)
+    return ok(fact)
 
 
 # --- the disk -----------------------------------------------------------------------------------------
@@ -94,38 +90,35 @@ def check_live_maps(diagnosis: Diagnosis) -> Finding:
 
 def check_live_disk(diagnosis: Diagnosis) -> Finding:
     """Check that the daemon can write to the directories of live maps, and that their disks have space."""
-    name = "live disk"
     places = _places(diagnosis)
     if not places:
-        return skip(name, "no live map is set up")
+        return skip("no live map is set up")
     facts, kept = [], {row.name for row in _rows(diagnosis)}
     for which, path in places.items():
         if not path:
-            return warn(name, f"{which}: there is no state directory", f"set path in [live.{which}]")
+            return warn(f"{which}: there is no state directory", f"set path in [live.{which}]")
         try:
             place = _existing(diagnosis, path)
             space = os.statvfs(diagnosis.machine.path(place))
             closed = _not_writable(diagnosis, path, place, read_only=bool(space.f_flag & os.ST_RDONLY))
         except PermissionError:
-            return warn(name, f"{which}: {path}: this user may not look there", "run it with sudo")
+            return warn(f"{which}: {path}: this user may not look there", "run it with sudo")
         if place != path and which in kept:
             return fail(
-                name,
                 f"{which}: {path} is gone",
                 "put it back where it was; what is not saved is in memory alone, so do not stop the daemon",
             )
         if closed:
-            return fail(name, f"{which}: {closed}", f"allow it, or set path in [live.{which}]")
+            return fail(f"{which}: {closed}", f"allow it, or set path in [live.{which}]")
         free = space.f_bavail * space.f_frsize
         budget = max((row.budget_bytes for row in _rows(diagnosis) if row.name == which), default=0)
         facts.append(f"{which}: {path}, {format_bytes(free)} free")
         if free < max(budget, ROOM_BYTES):
             return warn(
-                name,
                 f"{facts[-1]}; up to {format_bytes(max(budget, ROOM_BYTES))} may have to be saved",
                 "free some space: chunks that cannot be saved stay in memory, then mappers have to wait",
             )
-    return ok(name, "; ".join(facts))
+    return ok("; ".join(facts))
 
 
 def _places(diagnosis: Diagnosis) -> dict[str, str]:
@@ -162,11 +155,10 @@ def _not_writable(diagnosis: Diagnosis, path: str, place: str, *, read_only: boo
         return f"the file system of {place} is read-only"
     if diagnosis.is_service and not diagnosis.alive:
         own = f"{SERVICE_STATE}/{diagnosis.config.instance}"
-        if _is_in(path, own) and not _is_in(place, own):
+        if is_in(path, own) and not is_in(place, own):
             return ""  # systemd creates it
-        shown = re.findall(r"^(?:ReadWritePaths|BindPaths)=(.*)$", drop_ins(diagnosis), re.MULTILINE)
-        writable = [own, *(word.strip('"-+').split(":")[0] for word in " ".join(shown).split())]
-        if not any(_is_in(place, one) for one in writable):
+        writable = [own, *paths_of_service(diagnosis, "ReadWritePaths", "BindPaths")]
+        if not any(is_in(place, one) for one in writable):
             return f"the service may not write to {place}: ProtectSystem=, no ReadWritePaths="
     if uid == 0:
         return ""
@@ -175,43 +167,36 @@ def _not_writable(diagnosis: Diagnosis, path: str, place: str, *, read_only: boo
     return "" if (status.st_mode >> shift) & 3 == 3 else f"{account_name(uid)} may not write to {place}"
 
 
-def _is_in(path: str, directory: str) -> bool:
-    return f"{path}/".startswith(f"{directory.rstrip('/')}/")
-
-
 # --- memory -------------------------------------------------------------------------------------------
 
 
 def check_live_memory(diagnosis: Diagnosis) -> Finding:
     """Check the directory of chunks in memory, and that no reader uses many resources."""
-    name, rows = "live memory", _rows(diagnosis)
+    rows = _rows(diagnosis)
     if not rows and not diagnosis.config.live:
-        return skip(name, "no live map is set up")
+        return skip("no live map is set up")
     path = _live_shm_dir(diagnosis)
     if huge := _huge_pages(diagnosis, path):
         return fail(
-            name,
             f"{path} has huge pages ({huge}): a chunk of a few KiB takes 2 MiB there",
             "name a tmpfs without them with live_shm_dir, such as /dev/shm",
         )
     if wrong := _wrong_marks(diagnosis, path):
-        return warn(name, wrong, "restart the daemon: it puts the directory right, or says why it cannot")
+        return warn(wrong, "restart the daemon: it puts the directory right, or says why it cannot")
     if keeping := _keeping(diagnosis):
         return warn(
-            name,
             f"chunks are kept open or mapped: {keeping}",
             "have it read them by pread, as CHUNKS.md says: it keeps no memory by that, and SIGBUS ends it"
             " where it looks at one that was given up",
         )
     if busy := _busy(diagnosis):
         return warn(
-            name,
             f"requests take much of the time of the process that keeps live maps: {busy}",
             "have it ask less often, for smaller areas, or with `since`; mapping does not wait for it, other"
             " readers do",
         )
     taken, budget = sum(row.bytes for row in rows), sum(row.budget_bytes for row in rows)
-    return ok(name, f"{path}: {format_bytes(taken)} of {format_bytes(budget)} taken" if rows else path)
+    return ok(f"{path}: {format_bytes(taken)} of {format_bytes(budget)} taken" if rows else path)
 
 
 def _live_shm_dir(diagnosis: Diagnosis) -> str:

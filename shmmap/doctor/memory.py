@@ -50,61 +50,55 @@ def mount_of(machine: Machine, path: str) -> _Mount:
 
 def check_shared_memory(diagnosis: Diagnosis) -> Finding:
     """Check that the file system is large enough for the budget."""
-    name, path = "shared memory", diagnosis.shm_dir
+    path = diagnosis.shm_dir
     try:
         state = os.statvfs(diagnosis.machine.path(path))
     except OSError as error:
-        return fail(name, f"{path}: {error.strerror}", "name a directory on a tmpfs with shm_dir")
+        return fail(f"{path}: {error.strerror}", "name a directory on a tmpfs with shm_dir")
     mount = mount_of(diagnosis.machine, path)
     if mount.kind not in ("tmpfs", "ramfs", "unknown"):
         return fail(
-            name,
             f"{path} is on {mount.kind}: every segment would go to a disk",
             "name a directory on a tmpfs",
         )
     if not state.f_blocks:
-        return ok(name, f"{path}: {mount.kind} without a limit")
+        return ok(f"{path}: {mount.kind} without a limit")
     size, free = state.f_blocks * state.f_frsize, state.f_bavail * state.f_frsize
     used = sum(diagnosis.counters.get(f"bytes_{kind}", 0) for kind in ("resident", "zombie", "statistics"))
     budget = diagnosis.budget_bytes
     fact = f"{path}: {format_bytes(size)}, {format_bytes(free)} free"
     if not budget:
-        return ok(name, f"{fact}; the budget is chosen at start")
+        return ok(f"{fact}; the budget is chosen at start")
     fact += f"; budget {format_bytes(budget)}, of which {format_bytes(used)} taken"
-    enlarge = f"lower the budget, or enlarge it: `mount -o remount,size={_enough(budget)} {mount.point}`"
+    enough_gib = -(-(budget * 5 // 4) // (1 << 30))
+    enlarge = f"lower the budget, or enlarge it: `mount -o remount,size={enough_gib}G {mount.point}`"
     if budget > free + used:
-        return fail(name, fact, enlarge)
+        return fail(fact, enlarge)
     if budget > 0.95 * size:
-        return warn(name, fact, f"nothing is left for others: {enlarge}")
-    return ok(name, fact)
-
-
-def _enough(budget: int) -> str:
-    return f"{-(-(budget * 5 // 4) // (1 << 30))}G"
+        return warn(fact, f"nothing is left for others: {enlarge}")
+    return ok(fact)
 
 
 def check_container(diagnosis: Diagnosis) -> Finding:
     """Check that a container has enough shared memory."""
-    name = "container"
     machine = diagnosis.machine
     marks = ("/.dockerenv", "/run/.containerenv")
     contained = any(machine.path(mark).exists() for mark in marks) or bool(
         machine.text("/run/systemd/container")
     )
     if not contained:
-        return ok(name, "not in a container")
+        return ok("not in a container")
     try:
         state = os.statvfs(machine.path(diagnosis.shm_dir))
     except OSError as error:
-        return fail(name, f"{diagnosis.shm_dir}: {error.strerror}", "mount the host's with --ipc=host")
+        return fail(f"{diagnosis.shm_dir}: {error.strerror}", "mount the host's with --ipc=host")
     size = state.f_blocks * state.f_frsize
     if 0 < size <= CONTAINER_DEFAULT_BYTES:
         return warn(
-            name,
             f"in a container whose {diagnosis.shm_dir} has {format_bytes(size)}, the default",
             "a daemon inside needs --shm-size=8g; clients of a daemon outside need --ipc=host",
         )
-    return ok(name, f"in a container with {format_bytes(size)} of shared memory")
+    return ok(f"in a container with {format_bytes(size)} of shared memory")
 
 
 def _cgroup_limit(machine: Machine, pid: int) -> tuple[int, int]:
@@ -136,28 +130,27 @@ def check_memory_limit(diagnosis: Diagnosis) -> Finding:
     Segments are charged to the cgroup, as the daemon assumes when it chooses its budget.  Other memory of its
     processes is measured while the daemon runs.
     """
-    name = "memory limit"
     limit, private = _cgroup_limit(diagnosis.machine, diagnosis.pid)
     budget = diagnosis.budget_bytes
     if not limit:
-        return ok(name, "the control group sets no limit")
+        return ok("the control group sets no limit")
     chosen = format_bytes(budget) if budget else "chosen at start"
     fact = f"the control group allows {format_bytes(limit)}; budget {chosen}"
     room = room_in_group(limit)
     kills = "crossing it kills the daemon (segments are charged to it): lower the budget to"
     if budget > room:
-        return fail(name, fact, f"{kills} {format_bytes(room)}, or raise MemoryMax=")
+        return fail(fact, f"{kills} {format_bytes(room)}, or raise MemoryMax=")
     if diagnosis.alive:
         fact += f", and its processes use {format_bytes(private)}"
         if budget + private > limit:
             left = format_bytes(max(limit - private, 1 << 20))
-            return warn(name, fact, f"{kills} {left}, or raise MemoryMax=")
-    return ok(name, fact)
+            return warn(fact, f"{kills} {left}, or raise MemoryMax=")
+    return ok(fact)
 
 
 def check_huge_pages(diagnosis: Diagnosis) -> Finding:
     """Check whether segments use huge pages, and whether they help on this kernel."""
-    name, machine = "huge pages", diagnosis.machine
+    machine = diagnosis.machine
     mount = mount_of(machine, diagnosis.shm_dir)
     chosen = next((option for option in mount.options if option.startswith("huge=")), "huge=never")
     switch = re.search(r"\[(\w+)\]", machine.text("/sys/kernel/mm/transparent_hugepage/shmem_enabled"))
@@ -165,25 +158,24 @@ def check_huge_pages(diagnosis: Diagnosis) -> Finding:
     linux = f"Linux {kernel_version(release)}"
     better = f"mount -o remount,huge=within_size {mount.point}"
     if switch is None or switch[1] == "deny":
-        return ok(name, "off: the kernel has none for shared memory")
+        return ok("off: the kernel has none for shared memory")
     if switch[1] == "force":
-        return ok(name, "on: the kernel forces them on all shared memory (shmem_enabled)")
+        return ok("on: the kernel forces them on all shared memory (shmem_enabled)")
     if chosen == "huge=always":
-        return warn(name, f"{mount.point} has {chosen}, with which some loads take longer", better)
+        return warn(f"{mount.point} has {chosen}, with which some loads take longer", better)
     if chosen == "huge=advise":
-        return ok(name, f"off: {mount.point} has {chosen}, and what is written is never advised", better)
+        return ok(f"off: {mount.point} has {chosen}, and what is written is never advised", better)
     if chosen == "huge=within_size" and of_all_sizes(release):
-        return ok(name, f"on: {mount.point} has {chosen}; {linux} has them for cells of all sizes")
+        return ok(f"on: {mount.point} has {chosen}; {linux} has them for cells of all sizes")
     if chosen == "huge=within_size":
-        return ok(name, f"on: {mount.point} has {chosen}; {linux} has them for cells well above 2 MiB alone")
+        return ok(f"on: {mount.point} has {chosen}; {linux} has them for cells well above 2 MiB alone")
     if of_all_sizes(release):
         return ok(
-            name,
             f"off for {mount.point}",
             f"on {linux} cells load in 0.6 of the time with them: `sudo shmmap unit install --huge-pages`, or"
             f" `{better}`",
         )
-    return ok(name, f"off for {mount.point}; {linux} would have them for cells well above 2 MiB alone")
+    return ok(f"off for {mount.point}; {linux} would have them for cells well above 2 MiB alone")
 
 
 _SERVICE_CACHE: Final = "/var/cache/shmmap"
@@ -191,9 +183,9 @@ _SERVICE_CACHE: Final = "/var/cache/shmmap"
 
 def check_disk_cache(diagnosis: Diagnosis) -> Finding:
     """Check that the daemon owns the cache directory, and that its disk has space."""
-    name, uid = "disk cache", diagnosis.runs_as
+    uid = diagnosis.runs_as
     if not diagnosis.config.cache_bytes:
-        return skip(name, "nothing is kept: cache_bytes is 0")
+        return skip("nothing is kept: cache_bytes is 0")
     place = diagnosis.config.cache_dir or (
         _SERVICE_CACHE if diagnosis.is_service else default_cache_directory()
     )
@@ -202,15 +194,14 @@ def check_disk_cache(diagnosis: Diagnosis) -> Finding:
     try:
         status = os.stat(directory)
     except FileNotFoundError:
-        return skip(name, f"{place} is not there yet")
+        return skip(f"{place} is not there yet")
     except OSError as error:
-        return warn(name, f"{place}: {error.strerror}", "run it with sudo, or name another cache_dir")
+        return warn(f"{place}: {error.strerror}", "run it with sudo, or name another cache_dir")
     if not stat.S_ISDIR(status.st_mode):
-        return warn(name, f"{place} is no directory", "remove it, or name another cache_dir")
+        return warn(f"{place} is no directory", "remove it, or name another cache_dir")
     account = account_name(uid)
     if why := _why_not_used(diagnosis, place, status.st_uid):
         return warn(
-            name,
             f"{why}: objects of published maps are not kept there: without a connection there is no map",
             f"chown -R {account} {place} && chmod go-w {place}/{OBJECTS}, or name another cache_dir",
         )
@@ -224,11 +215,10 @@ def check_disk_cache(diagnosis: Diagnosis) -> Finding:
         fact = f"{place}: {format_bytes(used)} of {limit} used, {free}"
     if used < budget.limit_bytes and not budget.has_room(1):
         return warn(
-            name,
             f"{fact}: nothing more is kept, because 5 % of the disk stay free",
             "free some space, or name a cache_dir on another disk",
         )
-    return ok(name, fact)
+    return ok(fact)
 
 
 def _why_not_used(diagnosis: Diagnosis, place: str, owner: int) -> str:

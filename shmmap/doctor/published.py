@@ -22,28 +22,18 @@ from shmmap.doctor.verdicts import (
     valid_until,
     warn,
 )
-from shmmap.origin.remote.store import is_published, is_url
 from shmmap.quantities import format_duration, format_utc
 
 __all__ = ["check_clock", "check_credentials", "check_link", "check_signature", "check_versions"]
 
 MAX_OFF_S: Final = 60.0
 """Clock difference that the link's delay cannot explain; at 5 or 15 minutes stores refuse signed requests."""
-FILES: Final = "the map is files"
 _SKEW_S: Final = 300.0
 """Seconds allowed between the clocks of a publisher and of a vehicle."""
 
 
-def _is_published(diagnosis: Diagnosis) -> bool:
-    path = diagnosis.map_path
-    return bool(path) and is_published(path if is_url(path) else str(diagnosis.machine.path(path)))
-
-
 def check_link(diagnosis: Diagnosis) -> Finding:
     """Check that the store answers, and how fast."""
-    name = "link"
-    if not _is_published(diagnosis):
-        return skip(name, FILES)
     answer, path, counters = diagnosis.store, diagnosis.map_path, diagnosis.counters
     away = (
         f"the daemon has not reached it for {outage_so_far(counters)}" if counters.get("origin_out") else ""
@@ -54,38 +44,35 @@ def check_link(diagnosis: Diagnosis) -> Finding:
             times += f", {format_duration(answer.next_s)} for the next one"
         fact = f"{path} answers: {times}"
         if answer.error:
-            return warn(name, f"{fact}; {answer.error}", answer.hint or "is it the right URL?")
+            return warn(f"{fact}; {answer.error}", answer.hint or "is it the right URL?")
         if away:
-            return warn(name, f"{fact}; {away}", "it tries again each second; if that stays so, see its log")
-        return ok(name, fact)
+            return warn(f"{fact}; {away}", "it tries again each second; if that stays so, see its log")
+        return ok(fact)
     if answer.is_refused and diagnosis.environment is None and diagnosis.alive and not away:
-        return ok(name, f"{path} answers; it refuses what this account has for credentials")
+        return ok(f"{path} answers; it refuses what this account has for credentials")
     if answer.credentials_error:
-        return skip(name, f"{path} was not asked: see credentials")
+        return skip(f"{path} was not asked: see credentials")
     error = answer.error or f"no answer within {ASKED_S:.0f} s"
     fact = error if error.startswith(path) else f"{path}: {error}"
     if diagnosis.alive:
         fact += f"; {away or 'the daemon reached it when it last asked'}"
-    return warn(name, fact, answer.hint or "is the network up?")
+    return warn(fact, answer.hint or "is the network up?")
 
 
 def check_credentials(diagnosis: Diagnosis) -> Finding:
     """Check the source of the credentials, and that the store accepts them."""
-    name = "credentials"
-    if not _is_published(diagnosis):
-        return skip(name, FILES)
     answer, hidden = diagnosis.store, _hidden(diagnosis)
     if answer.credentials_error:
         hint = answer.credentials_hint or "`shmmap publish --help` says where they may come from"
-        return (warn if hidden else fail)(name, f"{answer.credentials_error}{hidden}", hint)
+        return (warn if hidden else fail)(f"{answer.credentials_error}{hidden}", hint)
     if not answer.credentials:
-        return skip(name, "a directory needs none, and a web server is asked without any")
+        return skip("a directory needs none, and a web server is asked without any")
     fact = f"from {answer.credentials}{hidden}"
     if answer.is_refused:
-        return warn(name, f"{fact}; {answer.error}", answer.hint)
+        return warn(f"{fact}; {answer.error}", answer.hint)
     if answer.first_s is None:
-        return ok(name, f"{fact}; the store was not reached")
-    return ok(name, f"{fact}; the store takes them")
+        return ok(f"{fact}; the store was not reached")
+    return ok(f"{fact}; the store takes them")
 
 
 def _hidden(diagnosis: Diagnosis) -> str:
@@ -98,18 +85,14 @@ def _hidden(diagnosis: Diagnosis) -> str:
 
 def check_clock(diagnosis: Diagnosis) -> Finding:
     """Check that this machine's clock agrees with the store's clock."""
-    name = "clock"
-    if not _is_published(diagnosis):
-        return skip(name, FILES)
     off_s = diagnosis.store.clock_s
     if off_s is None:
         answers = diagnosis.store.answers
-        return skip(name, f"the store {'does not say what time it is' if answers else 'was not reached'}")
+        return skip(f"the store {'does not say what time it is' if answers else 'was not reached'}")
     if abs(off_s) <= MAX_OFF_S:
-        return ok(name, f"within {max(abs(off_s), 1.0):.0f} s of the store's")
+        return ok(f"within {max(abs(off_s), 1.0):.0f} s of the store's")
     side = "behind" if off_s > 0 else "ahead of"
     return warn(
-        name,
         f"{format_duration(abs(off_s))} {side} the store's: what is signed is refused on both sides",
         "set the clock: timedatectl set-ntp true, or what the vehicle has for time",
     )
@@ -117,56 +100,47 @@ def check_clock(diagnosis: Diagnosis) -> Finding:
 
 def check_versions(diagnosis: Diagnosis) -> Finding:
     """Check that the newest published version is served, and how old it is."""
-    name = "versions"
-    if not _is_published(diagnosis):
-        return skip(name, FILES)
     answer, counters = diagnosis.store, diagnosis.counters
     served, offered = counters.get("published_version", 0), answer.version
     offer = "what is offered is not known"
     if offered:
         offer = f"version {offered}{_published(answer.created_s)} is offered"
     if not served:
-        return ok(name, offer) if offered else skip(name, f"{offer}; no daemon says what it serves")
+        return ok(offer) if offered else skip(f"{offer}; no daemon says what it serves")
     taken_s = counters["published_taken_unix_ns"] * 1e-9
     fact = f"version {served}{_published(answer.served_created_s)} is served, taken {_ago(taken_s)}"
     refused, advice = refused_offer(counters)
     if refused:
-        return warn(name, f"{fact}; {refused}", advice)
+        return warn(f"{fact}; {refused}", advice)
     if not offered or offered == served:
-        return ok(name, f"{fact}; {offer}" if not offered else f"{fact}; it is what is offered")
+        return ok(f"{fact}; {offer}" if not offered else f"{fact}; it is what is offered")
     if offered < served:
         return warn(
-            name,
             f"{fact}; {offer}, which is older",
             f"if it is meant: shmmap serve --accept-version {offered}; else publish again",
         )
-    return ok(name, f"{fact}; {offer}", "it is taken at the next --poll; `shmmap reload` takes it now")
+    return ok(f"{fact}; {offer}", "it is taken at the next --poll; `shmmap reload` takes it now")
 
 
 def check_signature(diagnosis: Diagnosis) -> Finding:
     """Check that the map's signature is verified, and has not expired."""
-    name = "signature"
-    if not diagnosis.alive:
-        return skip(name, "no daemon runs")
     counters, now_s = diagnosis.counters, time.time()
     signed_s, until_s = signature_times(counters)
     if not until_s:
-        return skip(name, "the map is not verified: the daemon runs without --trust")
+        return skip("the map is not verified: the daemon runs without --trust")
     if now_s + _SKEW_S < signed_s:
         return fail(
-            name,
             f"this machine's clock says {format_utc(now_s)}, earlier than {format_utc(signed_s)},"
             " when the map was signed",
             "set the clock: without it nothing can be found to have expired",
         )
     if expired := signature_expiry(counters, now_s):
         return fail(
-            name,
             expired,
             "is the store in reach and the clock right? shmmap versions URL --refresh --sign KEYDIR, once a"
             " day, keeps it valid",
         )
-    return ok(name, valid_until(until_s))
+    return ok(valid_until(until_s))
 
 
 def _published(created_s: float | None) -> str:

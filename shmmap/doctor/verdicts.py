@@ -42,6 +42,7 @@ class Finding:
     """One result of a check: subject, fact, and advice."""
 
     name: str
+    """Subject; `shmmap.doctor.checks.diagnose` fills it in."""
     state: State
     """``ok``; ``warn`` for what may cause trouble later; ``fail`` for what causes trouble now."""
     fact: str
@@ -51,24 +52,24 @@ class Finding:
     """Whether the check does not apply or was not possible, which is no problem; ``state`` is then ``ok``."""
 
 
-def skip(name: str, fact: str) -> Finding:
+def skip(fact: str) -> Finding:
     """Return a finding that the check does not apply."""
-    return Finding(name, "ok", fact, skipped=True)
+    return Finding("", "ok", fact, skipped=True)
 
 
-def ok(name: str, fact: str, advice: str = "") -> Finding:
+def ok(fact: str, advice: str = "") -> Finding:
     """Return a finding without a problem; ``advice`` may still suggest an improvement."""
-    return Finding(name, "ok", fact, advice)
+    return Finding("", "ok", fact, advice)
 
 
-def warn(name: str, fact: str, advice: str) -> Finding:
+def warn(fact: str, advice: str) -> Finding:
     """Return a finding that may cause trouble later."""
-    return Finding(name, "warn", fact, advice)
+    return Finding("", "warn", fact, advice)
 
 
-def fail(name: str, fact: str, advice: str) -> Finding:
+def fail(fact: str, advice: str) -> Finding:
     """Return a finding that hinders the daemon or a client now."""
-    return Finding(name, "fail", fact, advice)
+    return Finding("", "fail", fact, advice)
 
 
 def worst(findings: list[Finding]) -> State:

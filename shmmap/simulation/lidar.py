@@ -126,8 +126,6 @@ class LidarScan:
         (4, 4) float64, metres.
     xyz
         (N, 3) float32, sensor frame, metres.
-    ring
-        (N,) uint8, index of the ring: 0 is the lowest.
     moving
         (N,) uint8: 1 for points on moving objects.
     """
@@ -135,7 +133,6 @@ class LidarScan:
     stamp_s: float
     T_map_sensor: NDArray[np.float64]
     xyz: NDArray[np.float32]
-    ring: NDArray[np.uint8]
     moving: NDArray[np.uint8]
 
 
@@ -211,7 +208,7 @@ class LidarDrive:
             still = sum(len(part) for part in parts)
             returns = self.lidar.scan(np.concatenate([*parts, traffic.points(stamp_s)]), T, rng)
             moving = (returns.source >= still).astype(np.uint8)
-            yield LidarScan(stamp_s, T, returns.xyz, returns.ring, moving)
+            yield LidarScan(stamp_s, T, returns.xyz, moving)
 
     def _blocks(self, x: float, y: float) -> list[tuple[int, int]]:
         """Return the blocks within the LiDAR's range of a place."""

@@ -263,15 +263,6 @@ def test_what_it_writes_meanwhile(program: str, tmp_path: Path) -> None:
             one.read_line(60.0)
 
 
-def test_it_answers_lines_and_starts_again(program: str, tmp_path: Path) -> None:
-    with Program("one", program, ["for line in sys.stdin: print(line[::-1].strip())"], tmp_path) as one:
-        for text in ("map", "cell"):
-            one.write_line(text)
-            one.end_input()
-            assert one.finish(60.0) == text[::-1]
-            one.start()
-
-
 def test_one_that_says_nothing_is_not_waited_for_forever(program: str, tmp_path: Path) -> None:
     words = ["import signal; print('begun', flush=True); signal.pause()"]
     with Program("one", program, words, tmp_path) as one:

@@ -85,13 +85,6 @@ def test_query_differential(reading: Shmmap, standing_map: DividedMap) -> None:
     assert reading.json("query", "--circle", "0,0,5", "--held", *names)["cells"] == []
 
 
-def test_query_usage(reading: Shmmap) -> None:
-    for words in ("--id a --held b", "--circle 0,0,5 --held a@xyz", "--id a --z 0,1"):
-        done = reading.run("query", *words.split())
-        assert (done.returncode, done.stdout) == (2, ""), words
-        assert done.stderr.startswith("shmmap: ")
-
-
 def test_query_names_what_failed(shmmap: Shmmap, divided_map: DividedMap) -> None:
     (divided_map.pcd_dir / "0_0.pcd").write_bytes(b"not a point cloud")
     found = shmmap.json("query", "--id", "0_0.pcd", "20_0.pcd", code=1)
@@ -120,7 +113,7 @@ def test_what_is_printed_is_as_the_schemas_say(shmmap: Shmmap) -> None:
         assert [json.loads(json.dumps(one)) for one in outcomes] == [document], words
 
 
-def test_status_ls_health_while_the_daemon_is_stopped(shmmap: Shmmap, divided_map: DividedMap) -> None:
+def test_verbs_that_look_while_the_daemon_is_stopped(shmmap: Shmmap, divided_map: DividedMap) -> None:
     shmmap("query", "--circle", "0,0,5")
     pid = shmmap.daemon.pid
     os.kill(pid, signal.SIGSTOP)
@@ -136,6 +129,9 @@ def test_status_ls_health_while_the_daemon_is_stopped(shmmap: Shmmap, divided_ma
         assert status["counters"]["map_cells"] == 36
         assert shmmap.json("health", code=1)["state"] == "stopped"
         assert shmmap.json("ls")["state"] == "stopped"
+        assert "PAUSED" in shmmap("top")
+        assert "the daemon is paused: cells on disk are not shown" in shmmap("map")
+        assert f'shmmap_up{{daemon="{shmmap.daemon.instance}"}} 0' in shmmap("metrics")
         done = shmmap.run("clients")
         assert done.returncode == 69
         assert "hint: " in done.stderr
@@ -147,11 +143,12 @@ def test_status_ls_health_while_the_daemon_is_stopped(shmmap: Shmmap, divided_ma
     assert "0_0.pcd" in shmmap("ls")
 
 
-def test_status_of_a_dead_daemon(shmmap: Shmmap) -> None:
+def test_verbs_of_a_dead_daemon(shmmap: Shmmap) -> None:
     shmmap.daemon.kill()
     assert shmmap.json("health", code=69)["state"] == "dead"
     assert shmmap.json("status", code=69)["state"] == "dead"
-    assert shmmap.run("query", "--circle", "0,0,5").returncode == 69
+    for words in (["top"], ["map"], ["metrics"], ["tail"], ["query", "--circle", "0,0,5"]):
+        shmmap(*words, code=69)
 
 
 def test_ls_lists_what_is_resident(shmmap: Shmmap, divided_map: DividedMap) -> None:
@@ -294,6 +291,7 @@ def test_endpoint_alone_is_enough(reading: Shmmap) -> None:
         (["serve", ".", "--instance", "a/b"], 78),
         (["serve", ".", "--config", "missing.toml"], 78),
         (["serve"], 78),
+        (["doctor", "--config", "missing.toml"], 78),
         (["inspect", "missing.pcd"], 66),
         (["inspect", "missing"], 66),
         (["inspect", "broken.pcd"], 65),

@@ -13,7 +13,6 @@ from tests.process.conftest import DaemonFactory
 from tests.support.command_line import doctor
 from tests.support.daemon_process import DaemonProcess, Deadline
 from tests.support.divided_map import DividedMap
-from tests.support.forked_programs import run_verb
 
 
 def test_from_health_to_death(daemon: DaemonFactory, divided_map: DividedMap) -> None:
@@ -86,10 +85,3 @@ def test_entries_without_a_file_are_a_problem_of_the_map(
     one = daemon(divided_map.root)
     found = _until(one, "map", "warn")
     assert "reading it found 1 problem" in found["fact"]
-
-
-def test_a_configuration_with_a_mistake(daemon: DaemonFactory, divided_map: DividedMap) -> None:
-    one: DaemonProcess = daemon(divided_map.root, start=False)
-    done = run_verb(["doctor", "--config", one.runtime_dir + "/none.toml"])
-    assert done.returncode == 78
-    assert "none.toml" in done.stderr

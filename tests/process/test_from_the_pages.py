@@ -63,6 +63,12 @@ def plain(daemon: DaemonFactory) -> Iterator[Plain]:
         one.close()
 
 
+@pytest.fixture
+def one(standing: DaemonProcess, plain: Plain) -> PlainClient:
+    """Return a client with a session of a daemon that other tests use, too."""
+    return plain(standing)
+
+
 def refusal(one: PlainClient, tag: str, *elements: Any) -> str:
     with pytest.raises(Refused) as refused:
         one.ask(tag, *elements)
@@ -136,14 +142,12 @@ def test_everything_can_be_sent_at_once(standing: DaemonProcess, plain: Plain) -
     assert one.reply_to(99)[0] == "metadata_page", "a short one may have a long length"
 
 
-def test_long_requests_and_replies(standing: DaemonProcess, plain: Plain) -> None:
-    one = plain(standing)
+def test_long_requests_and_replies(one: PlainClient) -> None:
     held = [[f"/nowhere/{number}.pcd", number] for number in range(300)]
     assert one.ask("differential", HERE, ["points"], held)[5] == [cell for cell, _ in held]
 
 
-def test_ping(standing: DaemonProcess, plain: Plain) -> None:
-    one = plain(standing)
+def test_ping(one: PlainClient) -> None:
     one.connection.sendall(documented_bytes("ping"))
     context = bytes(range(16))
     one.send_frame(b"\x04PING\x00\x0a" + context, 4)
@@ -169,14 +173,12 @@ def test_a_peer_that_breaks_the_rules_is_disconnected(standing: DaemonProcess, w
             assert listener.read()[:64] == documented_bytes("greeting")
 
 
-def test_a_command_that_is_not_known_is_ignored(standing: DaemonProcess, plain: Plain) -> None:
-    one = plain(standing)
+def test_a_command_that_is_not_known_is_ignored(one: PlainClient) -> None:
     one.send_frame(b"\x05LATER\x01\x02\x03", 4)
     assert one.ask("metadata")[0] == "metadata_page"
 
 
-def test_several_frames_are_refused(standing: DaemonProcess, plain: Plain) -> None:
-    one = plain(standing)
+def test_several_frames_are_refused(one: PlainClient) -> None:
     one.send_frame(b"", 1)
     one.send_frame(pack(["metadata", 7]))
     with pytest.raises(Refused) as refused:
@@ -221,8 +223,7 @@ def test_every_minor_version_is_answered(standing: DaemonProcess, plain: Plain, 
     assert len(cells) == 12
 
 
-def test_what_the_daemon_does_not_know(standing: DaemonProcess, plain: Plain) -> None:
-    one = plain(standing)
+def test_what_the_daemon_does_not_know(one: PlainClient) -> None:
     assert refusal(one, "of_a_later_version", 1, 2) == "bad_request"
     assert one.ask("area", HERE, ["points"], 30.0, None, "new", {"a": 1})[0] == "cells"
     assert refusal(one, "hello", 3, 0) == "protocol_mismatch"
@@ -235,8 +236,7 @@ def test_what_the_daemon_does_not_know(standing: DaemonProcess, plain: Plain) ->
 # --- what is asked for ----------------------------------------------------------------------------
 
 
-def test_half_a_z_range(standing: DaemonProcess, plain: Plain) -> None:
-    one = plain(standing)
+def test_half_a_z_range(one: PlainClient) -> None:
     for half in ([1.0], [1.0, None], [None, 1.0]):
         for area in (["circle", 0, 0, 5, *half], ["square", 0, 0, 5, *half], ["box", 0, 0, 5, 5, *half]):
             for request in ("area", "differential", "metadata"):
@@ -245,8 +245,7 @@ def test_half_a_z_range(standing: DaemonProcess, plain: Plain) -> None:
         assert one.ask("metadata", ["circle", 0, 0, 5, *z])[4]
 
 
-def test_wait_has_limits(standing: DaemonProcess, plain: Plain) -> None:
-    one = plain(standing)
+def test_wait_has_limits(one: PlainClient) -> None:
     low, high = map(float, said(r"f64 seconds, (\d+) … (\d+), that the reply may wait"))
     for wait in (low, high, int(high), None):
         assert one.ask("area", ["circle", 1e6, 0, 1], ["points"], wait)[0] == "cells"
@@ -254,8 +253,7 @@ def test_wait_has_limits(standing: DaemonProcess, plain: Plain) -> None:
         assert refusal(one, "area", HERE, ["points"], wait) == "bad_request"
 
 
-def test_layers_in_canonical_form(standing: DaemonProcess, plain: Plain) -> None:
-    one = plain(standing)
+def test_layers_in_canonical_form(one: PlainClient) -> None:
     *others, canonical = said(
         r"`(ndt.*?)`, `(ndt.*?)` and `(ndt.*?)` are one layer, the last is its canonical form"
     )
@@ -277,8 +275,7 @@ def test_layers_in_canonical_form(standing: DaemonProcess, plain: Plain) -> None
     assert one.ask("differential", HERE, ["voxel( 1 )"])[9] == ["voxel(leaf=1.0)"], "cold: pending"
 
 
-def test_how_many_layers(standing: DaemonProcess, plain: Plain) -> None:
-    one = plain(standing)
+def test_how_many_layers(one: PlainClient) -> None:
     (most,) = said(r"an array of layer specs, at least one and at most (\d+);")
     assert one.ask("area", HERE, ["points"] * int(most))[9] == ["points"] * int(most)
     assert refusal(one, "area", HERE, ["points"] * (int(most) + 1)) == "bad_request"
@@ -297,10 +294,7 @@ def test_how_many_layers(standing: DaemonProcess, plain: Plain) -> None:
     assert refusal(one, "area", HERE, [chained(chain + 1)]) == "bad_request"
 
 
-def test_removed_repeats_ids_as_the_client_wrote_them(
-    standing: DaemonProcess, plain: Plain, standing_map: DividedMap
-) -> None:
-    one = plain(standing)
+def test_removed_repeats_ids_as_the_client_wrote_them(one: PlainClient, standing_map: DividedMap) -> None:
     far = standing_map.id("40_40.pcd")
     held = [[far], ["40_40.pcd"], ["no such cell"], [standing_map.id("0_0.pcd")], [far]]
     assert one.ask("differential", HERE, ["points"], held)[5] == [far, "40_40.pcd", "no such cell"]
@@ -310,8 +304,7 @@ def test_removed_repeats_ids_as_the_client_wrote_them(
     ]
 
 
-def test_limits_of_metadata(standing: DaemonProcess, plain: Plain) -> None:
-    one = plain(standing)
+def test_limits_of_metadata(one: PlainClient) -> None:
     first = one.ask("metadata", None, None, 0, 1)
     assert len(first[4]) == 1
     for start, limit in ((-5, 0), (0, -1), (-1, 1)):
@@ -328,8 +321,7 @@ def test_a_name_is_cut(served: DaemonProcess, plain: Plain) -> None:
     assert [row[4] for row in one.ask("stats")[5]] == ["ü" * int(most)]
 
 
-def test_every_connection_needs_a_hello(standing: DaemonProcess, plain: Plain) -> None:
-    one = plain(standing)
+def test_every_connection_needs_a_hello(standing: DaemonProcess, plain: Plain, one: PlainClient) -> None:
     other = plain(standing, hello=False)
     assert refusal(other, "metadata") == "no_session"
     session = one.session
@@ -365,8 +357,7 @@ def test_a_session_is_taken_over(served: DaemonProcess, plain: Plain) -> None:
     mapping.close()
 
 
-def test_a_session_is_a_wish(standing: DaemonProcess, plain: Plain) -> None:
-    one = plain(standing)
+def test_a_session_is_a_wish(standing: DaemonProcess, plain: Plain, one: PlainClient) -> None:
     (power,) = said(r"\(another session's; 2\^(\d+) and more\)")
     for wish, granted in (
         (12345, True),
@@ -439,8 +430,7 @@ def test_release_is_of_every_layer_that_carried_the_version(served: DaemonProces
 # --- handles and segments -------------------------------------------------------------------------
 
 
-def test_what_a_handle_says(standing: DaemonProcess, plain: Plain, standing_map: DividedMap) -> None:
-    one = plain(standing)
+def test_what_a_handle_says(one: PlainClient, standing_map: DividedMap) -> None:
     handles = one.ask("area", HERE, ["points", "voxel(1)"], 30.0)[4]
     assert len(handles) == 8
     for handle in handles:

@@ -233,20 +233,6 @@ def test_a_picture_of_too_many_cells(
     assert "the map spans x -60 .. 60 m, y -60 .. 60 m" in " ".join(capsys.readouterr().err.split())
 
 
-def test_while_the_daemon_is_stopped_and_after_it_was_killed(shmmap: Shmmap) -> None:
-    shmmap("query", "--circle", "0,0,25")
-    shmmap.daemon.send(signal.SIGSTOP)
-    assert "PAUSED" in shmmap("top")
-    assert "the daemon is paused: cells on disk are not shown" in shmmap("map")
-    assert f'shmmap_up{{daemon="{shmmap.daemon.instance}"}} 0' in shmmap("metrics")
-    shmmap.daemon.send(signal.SIGCONT)
-    shmmap.daemon.kill()
-    for verb in ("top", "map", "metrics"):
-        shmmap(verb, code=69)
-    assert shmmap.run("tail").returncode == 69
-    shmmap.daemon.start()
-
-
 def read_until(fd: int, wanted: bytes, seen: bytes = b"") -> bytes:
     """Read a terminal until it was sent something."""
     end_s = time.monotonic() + DEADLINE_S

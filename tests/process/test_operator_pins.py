@@ -33,6 +33,15 @@ def wait_for_pins(client: RawClient, expected: dict[str, str]) -> None:
         client.ask("stats")
 
 
+def assert_stopped(one: DaemonProcess, pid: int) -> None:
+    """The daemon has ended by itself and left nothing."""
+    assert wait_ended(pid)
+    assert one.process is not None
+    process, one.process = one.process, None
+    assert process.wait() == 0
+    assert one.leftovers() == []
+
+
 def test_a_pinned_cell_is_loaded_and_stays(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
 ) -> None:
@@ -94,11 +103,7 @@ def test_stop(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) 
     client.area(circle(0, 0, 60))
     pid = one.pid
     assert client.ask("shutdown")[0] == "stopping"
-    assert wait_ended(pid)
-    assert one.process is not None
-    process, one.process = one.process, None
-    assert process.wait() == 0
-    assert one.leftovers() == []
+    assert_stopped(one, pid)
 
 
 _AS_MEMBER = """
@@ -146,8 +151,4 @@ def test_only_administrators_change_anything(daemon: DaemonFactory, divided_map:
     assert as_member(one, GROUP) == {**refused, "stats": "done"}
     pid = one.pid
     assert set(as_member(one, ADMINS).values()) == {"done"}
-    assert wait_ended(pid)
-    assert one.process is not None
-    process, one.process = one.process, None
-    assert process.wait() == 0
-    assert one.leftovers() == []
+    assert_stopped(one, pid)

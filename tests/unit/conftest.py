@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import Any, Protocol
 
 import pytest
 
+from shmmap.cli.entry import main
 from shmmap.segment.directory import ShmDirectory
 
 
@@ -18,3 +20,20 @@ def shm() -> Iterator[ShmDirectory]:
         directory = ShmDirectory(path)
         yield directory
         directory.close()
+
+
+class Verb(Protocol):
+    """Runs a verb in this process; returns what was printed (``out``, ``err``) since it was last asked."""
+
+    def __call__(self, words: Sequence[str], code: int = 0) -> Any: ...
+
+
+@pytest.fixture
+def verb(capsys: pytest.CaptureFixture[str]) -> Verb:
+    """Return the command line, which checks the exit code."""
+
+    def run(words: Sequence[str], code: int = 0) -> Any:
+        assert main(words) == code
+        return capsys.readouterr()
+
+    return run

@@ -24,7 +24,6 @@ from shmmap.errors import (
     NoColumn,
     PackageMissing,
     ShmmapError,
-    ShmmapWarning,
     error_from_wire,
 )
 from shmmap.formats.durable_file import writing_errors
@@ -127,58 +126,51 @@ except shmmap.ShmmapError as error:
 """
 
 
+def said_without(packages: set[str], call: str) -> str:
+    """Return what a program prints that makes this call where these packages are not installed."""
+    code = "import numpy\n" + CLIENT_ONLY.format(packages=packages, code=call)
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+
+
 @pytest.mark.parametrize(
     "code",
     ["shmmap.layers.build_layer", "shmmap.read_cloud", "shmmap.layers.voxel_covariances", "shmmap.write_pcd"],
 )
 def test_every_public_name_of_a_client_only_install_works_or_says_what_it_needs(code: str) -> None:
     packages = {"xxhash", "lzf", "yaml", "numba", "rich", "open3d", "scipy", "pandas", "laspy"}
-    done = subprocess.run(
-        [sys.executable, "-c", CLIENT_ONLY.format(packages=packages, code=code)],
-        capture_output=True, text=True, check=True,
-    )  # fmt: skip
-    assert done.stdout.startswith("<function") or re.fullmatch(
-        rf"package_missing {code} needs the package [\w-]+, which is not installed \(pip install .*\)\n",
-        done.stdout,
-    ), done.stdout
-
-
-def test_build_layer_is_one_of_those() -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", CLIENT_ONLY.format(packages={"xxhash"}, code="shmmap.layers.build_layer")],
-        capture_output=True, text=True, check=True,
-    )  # fmt: skip
-    assert done.stdout.startswith("package_missing shmmap.layers.build_layer needs the package xxhash")
-    assert "pip install shmmap" not in done.stdout, "it is on no index"
+    said = said_without(packages, code)
+    assert said.startswith("<function") or re.fullmatch(
+        rf"package_missing {code} needs the package [\w-]+, which is not installed \(pip install .*\)\n", said
+    ), said
+    assert "pip install shmmap" not in said, "it is on no index"
 
 
 @pytest.mark.parametrize(
-    ("call", "what"),
+    ("packages", "call", "what"),
     [
-        ("shmmap.layers.build_layer('voxel(leaf=1.0)', numpy.zeros((3, 3)))", "layer voxel"),
-        ("shmmap.layers.voxel_covariances(*[numpy.zeros((1, 3, 3))] * 2)", r"voxel_covariances\(\)"),
+        ({"xxhash"}, "shmmap.layers.build_layer", "shmmap.layers.build_layer needs the package xxhash"),
+        (
+            {"numba"},
+            "shmmap.layers.build_layer('voxel(leaf=1.0)', numpy.zeros((3, 3)))",
+            "layer voxel needs the package numba",
+        ),
+        (
+            {"numba"},
+            "shmmap.layers.voxel_covariances(*[numpy.zeros((1, 3, 3))] * 2)",
+            "voxel_covariances() needs the package numba",
+        ),
+        # a client-only install reads live maps
+        (
+            {"numba", "xxhash", "zstandard"},
+            "shmmap.live.Voxels and shmmap.live.ScanFilter and shmmap.live.LiveMap.mapper(None, 'front')",
+            "mapping needs the package numba",
+        ),
     ],
 )
-def test_what_loads_a_package_only_when_it_is_called_says_so_too(call: str, what: str) -> None:
-    code = CLIENT_ONLY.format(packages={"numba"}, code=call)
-    done = subprocess.run(
-        [sys.executable, "-c", "import numpy\n" + code], capture_output=True, text=True, check=True
-    )
-    assert re.match(f"package_missing {what} needs the package numba", done.stdout), done.stdout
-
-
-def test_a_client_only_install_reads_live_maps_and_says_what_mapping_needs() -> None:
-    call = "shmmap.live.Voxels and shmmap.live.ScanFilter and shmmap.live.LiveMap.mapper(None, 'front')"
-    code = CLIENT_ONLY.format(packages={"numba", "xxhash", "zstandard"}, code=call)
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.startswith("package_missing mapping needs the package numba"), done.stdout
-
-
-def test_all_public_errors_are_of_the_tree() -> None:
-    for name in dir(shmmap):
-        value = getattr(shmmap, name)
-        if isinstance(value, type) and issubclass(value, BaseException) and value is not ShmmapWarning:
-            assert value in set(kinds())
+def test_what_loads_a_package_only_when_it_is_called_says_so_too(
+    packages: set[str], call: str, what: str
+) -> None:
+    assert said_without(packages, call).startswith(f"package_missing {what}")
 
 
 def test_no_other_public_name_is_that_of_a_module() -> None:

@@ -299,13 +299,3 @@ def test_command_line_starts_without_packages(words: list[str]) -> None:
         f"with contextlib.suppress(SystemExit), contextlib.redirect_stdout(io.StringIO()): main({words!r})"
     )
     assert not loaded_after(code) & (HEAVY | CLIENT_PACKAGES)
-
-
-@pytest.mark.parametrize("verb", ["status", "ls", "health"])
-def test_statistics_verbs_need_no_package(verb: str, tmp_path: Path) -> None:
-    code = (
-        "import contextlib, io\nfrom shmmap.cli import main\n"
-        "with contextlib.redirect_stderr(io.StringIO()):\n"
-        f"  assert main([{verb!r}, '--shm-dir', {str(tmp_path)!r}]) == 69"
-    )
-    assert not loaded_after(code) & (HEAVY | CLIENT_PACKAGES)

@@ -93,31 +93,10 @@ def test_another_source_is_another_kernel(kernel: Kernel, caplog: pytest.LogCapt
 # --- damage ----------------------------------------------------------------------------------------
 
 
-def empty(path: Path) -> None:
-    path.write_bytes(b"")
-
-
-def shorten(path: Path) -> None:
-    os.truncate(path, path.stat().st_size // 2)
-
-
-def flip(at: int) -> Callable[[Path], None]:
-    def damage(path: Path) -> None:
-        data = bytearray(path.read_bytes())
-        data[at] ^= 1
-        path.write_bytes(data)
-
-    damage.__name__ = f"flip_{at}"
-    return damage
-
-
-def zeros(path: Path) -> None:
-    """What a power cut leaves of a file that was not flushed."""
-    path.write_bytes(bytes(path.stat().st_size))
-
-
-def enlarge(path: Path) -> None:
-    os.truncate(path, 1 << 40)
+def flip(path: Path, at: int) -> None:
+    data = bytearray(path.read_bytes())
+    data[at] ^= 1
+    path.write_bytes(data)
 
 
 def a_pipe(path: Path) -> None:
@@ -135,46 +114,44 @@ def a_loop(path: Path) -> None:
     path.symlink_to(path)
 
 
-def unreadable(path: Path) -> None:
-    path.chmod(0)
-
-
-def _with_payload(path: Path, payload: bytes) -> None:
+def give_payload(path: Path, payload: bytes) -> None:
+    """Replace the kernel; its file is as good as before."""
     head = path.read_bytes()[:40]
     path.write_bytes(head + hashlib.sha256(payload).digest() + payload)
 
 
-def no_pickle(path: Path) -> None:
-    _with_payload(path, b"no pickle")
+DAMAGES: dict[str, Callable[[Path], object]] = {
+    "empty": lambda path: path.write_bytes(b""),
+    "shortened": lambda path: os.truncate(path, path.stat().st_size // 2),
+    "another magic": lambda path: flip(path, 0),
+    "of another version": lambda path: flip(path, 20),
+    "another hash": lambda path: flip(path, 50),
+    "another kernel": lambda path: flip(path, -1),
+    "zeros, as a power cut leaves them": lambda path: path.write_bytes(bytes(path.stat().st_size)),
+    "enlarged": lambda path: os.truncate(path, 1 << 40),
+    "a pipe": a_pipe,
+    "a link": a_link,
+    "a loop": a_loop,
+    "unreadable": lambda path: path.chmod(0),
+    "no pickle": lambda path: give_payload(path, b"no pickle"),
+    "of a module that is gone": lambda path: give_payload(path, b"cnumba.gone\nName\n."),
+    "of something else": lambda path: give_payload(path, pickle.dumps(("a", 1))),
+}
 
 
-def of_a_module_that_is_gone(path: Path) -> None:
-    _with_payload(path, b"cnumba.gone\nName\n.")
-
-
-def of_something_else(path: Path) -> None:
-    _with_payload(path, pickle.dumps(("a", 1)))
-
-
-DAMAGES = [
-    empty, shorten, flip(0), flip(20), flip(50), flip(-1), zeros, enlarge, a_pipe, a_link, a_loop, unreadable,
-    no_pickle, of_a_module_that_is_gone, of_something_else,
-]  # fmt: skip
-
-
-@pytest.mark.parametrize("damage", DAMAGES, ids=lambda damage: damage.__name__)
+@pytest.mark.parametrize("what", DAMAGES)
 def test_a_damaged_kernel_is_compiled_and_replaced(
-    kernel: Kernel, damage: Callable[[Path], None], caplog: pytest.LogCaptureFixture
+    kernel: Kernel, what: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     kernel.hits()
     (mark := kernel_cache.compiled_mark() or Path()).touch()
-    damage(file := kernel.file)
-    if damage is unreadable and os.geteuid() == 0:
+    DAMAGES[what](file := kernel.file)
+    if what == "unreadable" and os.geteuid() == 0:
         assert kernel.hits() == 1
         return
     assert [kernel.hits(), kernel.hits()] == [0, 1]
-    if damage.__name__ == "flip_20":
-        return  # as of another version: nothing is logged
+    if what == "of another version":
+        return  # nothing is logged
     assert not mark.exists()  # the next daemon looks after all of them
     (line,) = warnings(caplog)
     assert line.startswith(f"compiled kernel discarded path={file} reason=")
@@ -183,7 +160,7 @@ def test_a_damaged_kernel_is_compiled_and_replaced(
 def test_damage_is_logged_once(kernel: Kernel, caplog: pytest.LogCaptureFixture) -> None:
     for _ in range(3):
         kernel.hits()
-        empty(kernel.file)
+        kernel.file.write_bytes(b"")
     assert len(warnings(caplog)) == 1
 
 
@@ -256,25 +233,18 @@ def test_without_a_home(monkeypatch: pytest.MonkeyPatch, kernel: Kernel) -> None
     assert kernel_cache.kernel_directory() is None
 
 
-def _import_twice(kernel: Kernel, before: Callable[[], None]) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [
-            sys.executable,
-            "-c",
-            "import doubling; print(doubling.doubled(21), sum(doubling.doubled.stats.cache_hits.values()))",
-        ],
-        cwd=kernel.module.parent, env={**os.environ, "PYTHONPATH": os.pathsep.join(["", *sys.path])},
-        preexec_fn=before, capture_output=True, text=True, check=True,
-    )  # fmt: skip
-
-
 def test_a_file_too_large_for_a_limit(kernel: Kernel) -> None:
     """As on a full disk: the file is begun, and cannot be finished; which is tried again."""
-
-    def limit() -> None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (1024, 1024))
-
-    done = _import_twice(kernel, limit)
+    program = "import doubling; print(doubling.doubled(21), sum(doubling.doubled.stats.cache_hits.values()))"
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        cwd=kernel.module.parent,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(["", *sys.path])},
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (1024, 1024)),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     assert done.stdout == "42 0\n"
     assert done.stderr.count("compiled kernels are not kept") == 1
     assert os.strerror(errno.EFBIG) in done.stderr
@@ -330,7 +300,7 @@ def test_a_file_that_others_may_have_written_is_not_run(
 ) -> None:  # fmt: skip
     kernel.hits()
     path = kernel.file
-    _with_payload(path, pickle.dumps(Harm(tmp_path / "harm")))
+    give_payload(path, pickle.dumps(Harm(tmp_path / "harm")))
     path.chmod(mode)
     if others:
         give_away(path, monkeypatch)
@@ -376,9 +346,6 @@ def test_kernels_that_came_with_an_image_are_used(
 # --- kernels are compiled by one process at a time, and what is compiled is marked ------------------------
 
 
-pytest.importorskip("numba", reason="needs the package numba")
-
-
 @pytest.fixture
 def mark(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     path = tmp_path / "layers.compiled"
@@ -386,16 +353,13 @@ def mark(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return path
 
 
-def test_what_is_compiled_is_marked(mark: Path) -> None:
-    build.compile_kernels()
-    assert mark.exists()
-
-
-def test_another_process_is_left_at_it(mark: Path) -> None:
+def test_what_is_compiled_is_marked_by_one_process_at_a_time(mark: Path) -> None:
     with mark.with_suffix(".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         build.compile_kernels(wait=False)
-    assert not mark.exists()
+        assert not mark.exists()
+    build.compile_kernels()
+    assert mark.exists()
 
 
 def test_where_nothing_can_be_kept_nothing_is_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

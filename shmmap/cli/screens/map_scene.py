@@ -196,11 +196,10 @@ def _cell_title(rows: Sequence[CellRow], now_ns: int) -> str:
 
 
 def _client_title(client: ClientRow, now_ns: int) -> str:
-    idle_s = max(now_ns - client.last_request_monotonic_ns, 0) * 1e-9
     return (
         f"{client.client or client.command or 'a client'}, pid {client.pid or '?'}\n"
         f"{client.cells:,} cells, {format_bytes(client.bytes)}, {client.requests:,} requests,"
-        f" the last {format_duration(idle_s)} ago"
+        f" the last {format_duration(client.idle_s(now_ns))} ago"
     )
 
 

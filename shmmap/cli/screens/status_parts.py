@@ -12,6 +12,7 @@ from shmmap.quantities import counted, format_bytes, format_duration, format_utc
 
 if TYPE_CHECKING:
     from shmmap.protocol.rows import LiveMapRow
+    from shmmap.statistics.identity import DaemonIdentity
 
 __all__ = [
     "STATE_STYLES",
@@ -22,7 +23,13 @@ __all__ = [
     "published_words",
     "since",
     "status_lines",
+    "uptime_s",
 ]
+
+
+def uptime_s(identity: DaemonIdentity) -> float:
+    """Return for how long the daemon has run, seconds."""
+    return max(time.time() - identity.started_unix_ns * 1e-9, 0.0)
 
 
 def over_fetch(counters: Mapping[str, int]) -> float | None:
@@ -56,7 +63,7 @@ def published_lines(counters: Mapping[str, int]) -> list[tuple[str, str]]:
     if not counters.get("published_version"):
         return []
     lines = [("version", _version(counters)), ("known", _known(counters)), ("fetched", _fetched(counters))]
-    lines[1:1] = [("signature", text) for text in _signature(counters)]
+    lines[1:1] = [("signature", text) for text in signature_lines(counters, time.time())]
     if troubles := _troubles(counters):
         lines.append(("", troubles))
     return lines
@@ -66,9 +73,10 @@ def published_words(counters: Mapping[str, int]) -> list[tuple[str, bool]]:
     """Return short texts about a published map, each with whether it is a problem."""
     if not counters.get("published_version"):
         return []
-    problems = trust_problems(counters, time.time())
+    now_s = time.time()
+    problems = trust_problems(counters, now_s)
     pieces = [(f"version {_version(counters)}", False)]
-    pieces += [(text, text in problems) for text in _signature(counters)]
+    pieces += [(text, text in problems) for text in signature_lines(counters, now_s)]
     pieces += [(_known(counters), False), (_fetched(counters), False), (_troubles(counters), True)]
     return [(text, trouble) for text, trouble in pieces if text]
 
@@ -83,10 +91,6 @@ def _version(counters: Mapping[str, int]) -> str:
     taken_ns = counters["published_taken_unix_ns"]
     ago = format_duration(max(time.time() - taken_ns * 1e-9, 0.0))
     return f"{counters['published_version']}, taken on {format_utc(taken_ns // 10**9)}, {ago} ago"
-
-
-def _signature(counters: Mapping[str, int]) -> list[str]:
-    return signature_lines(counters, time.time())
 
 
 def _known(counters: Mapping[str, int]) -> str:

@@ -8,7 +8,13 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 from shmmap.cli.screens.output import counted, format_bytes, format_duration, printable
-from shmmap.cli.screens.status_parts import STATE_STYLES, live_problems, prefetch_words, published_words
+from shmmap.cli.screens.status_parts import (
+    STATE_STYLES,
+    live_problems,
+    prefetch_words,
+    published_words,
+    uptime_s,
+)
 from shmmap.doctor.verdicts import cache_verdict, outage_so_far
 from shmmap.statistics.counters import TURN_KINDS
 
@@ -146,9 +152,8 @@ def _flowing(label: str, units: Sequence[Line], width: int, *, gap: int = 3) -> 
 
 
 def _title(found: Snapshot, identity: DaemonIdentity) -> Line:
-    uptime_s = max(time.time() - identity.started_unix_ns * 1e-9, 0.0)
     words = {
-        "healthy": f"  up {format_duration(uptime_s)}",
+        "healthy": f"  up {format_duration(uptime_s(identity))}",
         "stopped": f"  no heartbeat for {format_duration(found.beat_age_s)}: `kill -CONT {identity.pid}`",
         "hung": f"  no heartbeat for {format_duration(found.beat_age_s)}",
         "dead": "  crashed or was killed; these are its last figures",
@@ -293,12 +298,12 @@ def _clients(
     column = max(_SHORTEST_NAME, min(max(map(len, names), default=0), room))
     lines: list[Line] = [[(f"{'CLIENT':{column}}{rest}"[:width], "bold")]]
     for client, name, at in zip(shown, names, places, strict=True):
-        idle_s = max(now_ns - client.last_request_monotonic_ns, 0) * 1e-9
         called = name if len(name) <= column else f"{name[: column - 1]}…"
         uid = f" {client.uid:>6}" if with_uid else ""
         row = (
             f"{called:{column}} {client.pid or '?':>8}{uid} {client.cells:>6,}"
-            f" {format_bytes(client.bytes):>9} {client.requests:>9,} {format_duration(idle_s):>8}  {at}"
+            f" {format_bytes(client.bytes):>9} {client.requests:>9,}"
+            f" {format_duration(client.idle_s(now_ns)):>8}  {at}"
         )
         lines.append([(row[:width], "")])
     more = sessions - len(shown)

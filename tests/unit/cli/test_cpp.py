@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 
 import shmmap
-from shmmap.cli.entry import main
 from shmmap.cli.verbs.run.about import prefix
 from tests.support.daemon_process import ROOT
 from tests.support.pages import read_page
+from tests.unit.conftest import Verb
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -31,47 +31,31 @@ CPP = ROOT / "clients" / "cpp"
         ("--pkgconfigdir", f"{CPP}/share/pkgconfig\n", "share/pkgconfig/shmmap.pc"),
     ],
 )
-def test_a_checkout_is_used_where_it_lies(
-    option: str, says: str, file: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["cpp", option]) == 0
-    assert capsys.readouterr().out == says
+def test_a_checkout_is_used_where_it_lies(option: str, says: str, file: str, verb: Verb) -> None:
+    assert verb(["cpp", option]).out == says
     assert (CPP / file).is_file()
     assert str((CPP / file).parent).startswith(says.removeprefix("-I").rstrip())
 
 
-def test_without_an_option_it_says_how_to_compile(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["cpp"]) == 0
-    assert f"\n  g++ -std=c++17 -I{CPP}/include PROGRAM.cpp\n" in capsys.readouterr().out
+def test_without_an_option_it_says_how_to_compile(verb: Verb) -> None:
+    assert f"\n  g++ -std=c++17 -I{CPP}/include PROGRAM.cpp\n" in verb(["cpp"]).out
 
 
-def test_one_option_at_a_time(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(["cpp", "--includes", "--cmakedir"])
-    assert ended.value.code == 2
-    assert "not allowed with argument --includes" in capsys.readouterr().err
-
-
-def test_a_shell_reads_one_option(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_shell_reads_one_option(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verb: Verb) -> None:
     package = tmp_path / "two words" / "shmmap"
     header = package / "_cpp" / "include" / "shmmap" / "shmmap.hpp"
     header.parent.mkdir(parents=True)
     header.touch()
     monkeypatch.setattr(shmmap, "__file__", str(package / "__init__.py"))
-    assert main(["cpp", "--includes"]) == 0
-    assert capsys.readouterr().out == f"'-I{package}/_cpp/include'\n"
-    assert main(["cpp", "--cmakedir"]) == 0
-    assert capsys.readouterr().out == f"{package}/_cpp/share/cmake/shmmap\n"
+    assert verb(["cpp", "--includes"]).out == f"'-I{package}/_cpp/include'\n"
+    assert verb(["cpp", "--cmakedir"]).out == f"{package}/_cpp/share/cmake/shmmap\n"
 
 
 def test_an_installation_that_came_without_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verb: Verb
 ) -> None:
     monkeypatch.setattr(shmmap, "__file__", str(tmp_path / "shmmap" / "__init__.py"))
-    assert main(["cpp"]) == 70
-    assert "came without its C++ header" in capsys.readouterr().err
+    assert "came without its C++ header" in verb(["cpp"], 70).err
 
 
 def test_a_wheel_has_it_where_it_is_looked_for_first() -> None:

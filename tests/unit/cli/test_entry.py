@@ -15,6 +15,7 @@ import pytest
 from shmmap import errors
 from shmmap.cli.entry import main
 from shmmap.cli.verbs.run import about
+from tests.unit.conftest import Verb
 
 EXIT_CODES = {
     "ConfigError": 78,
@@ -41,47 +42,48 @@ def fail_with(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
     monkeypatch.setattr(about, "run_version", run)
 
 
-@pytest.mark.parametrize(("name", "code"), EXIT_CODES.items())
+AFTER_CTRL_C = ValueError("it cannot be closed now")
+AFTER_CTRL_C.__context__ = KeyboardInterrupt()
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [
+        *(
+            (getattr(errors, name)("it broke", hint="mend it"), code, "shmmap: it broke\nhint: mend it\n")
+            for name, code in EXIT_CODES.items()
+        ),
+        (errors.MapMissing("no map at /nowhere"), 66, "shmmap: no map at /nowhere\n"),
+        (KeyboardInterrupt(), 130, ""),
+        (AFTER_CTRL_C, 130, ""),
+    ],
+)
 def test_exit_codes_of_the_contract(
-    name: str, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    error: BaseException,
+    code: int,
+    said: str,
+    monkeypatch: pytest.MonkeyPatch,
+    verb: Verb,
 ) -> None:
-    fail_with(monkeypatch, getattr(errors, name)("it broke", hint="mend it"))
-    assert main(["version"]) == code
-    assert capsys.readouterr() == ("", "shmmap: it broke\nhint: mend it\n")
+    """What goes wrong while cleaning up after Ctrl-C is no defect."""
+    fail_with(monkeypatch, error)
+    assert verb(["version"], code) == ("", said)
 
 
-def test_a_missing_package_is_one_line(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_missing_package_is_one_line(monkeypatch: pytest.MonkeyPatch, verb: Verb) -> None:
     """As where only the client's packages are installed."""
     fail_with(monkeypatch, ModuleNotFoundError("No module named 'xxhash'", name="xxhash"))
-    assert main(["version"]) == errors.PackageMissing.exit_code
-    out, err = capsys.readouterr()
+    out, err = verb(["version"], errors.PackageMissing.exit_code)
     assert out == ""
     assert err.startswith("shmmap: shmmap version needs the package xxhash, which is not installed\n")
 
 
-def test_no_hint_no_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    fail_with(monkeypatch, errors.MapMissing("no map at /nowhere"))
-    assert main(["version"]) == 66
-    assert capsys.readouterr().err == "shmmap: no map at /nowhere\n"
-
-
-def test_a_defect_shows_its_traceback_and_asks_to_report(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_defect_shows_its_traceback_and_asks_to_report(monkeypatch: pytest.MonkeyPatch, verb: Verb) -> None:
     fail_with(monkeypatch, ZeroDivisionError("oops"))
-    assert main(["version"]) == 70
-    said = capsys.readouterr().err
+    said = verb(["version"], 70).err
     assert "Traceback" in said
     assert "shmmap: internal error: ZeroDivisionError: oops\nhint: " in said
     assert "report" in said.splitlines()[-1]
-
-
-def test_ctrl_c_is_quiet(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    fail_with(monkeypatch, KeyboardInterrupt())
-    assert main(["version"]) == 130
-    assert capsys.readouterr() == ("", "")
 
 
 def test_ctrl_c_within_exec_is_an_exit_code(tmp_path: Path) -> None:
@@ -92,16 +94,6 @@ def test_ctrl_c_within_exec_is_an_exit_code(tmp_path: Path) -> None:
     )
     done = subprocess.run([sys.executable, "-m", "interrupted"], cwd=tmp_path, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (130, "")
-
-
-def test_an_error_of_cleaning_up_after_ctrl_c_is_no_defect(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    error = ValueError("it cannot be closed now")
-    error.__context__ = KeyboardInterrupt()
-    fail_with(monkeypatch, error)
-    assert main(["version"]) == 130
-    assert capsys.readouterr() == ("", "")
 
 
 def test_a_reader_that_went_away_is_no_error() -> None:
@@ -143,13 +135,12 @@ def test_closed_streams_are_no_defect() -> None:
     assert (done.stdout, done.stderr) == ("0\n2\n", "")
 
 
-def test_version_and_its_json(capsys: pytest.CaptureFixture[str]) -> None:
+def test_version_and_its_json(verb: Verb, capsys: pytest.CaptureFixture[str]) -> None:
     import json
 
     import shmmap
 
-    assert main(["version", "--json"]) == 0
-    document = json.loads(capsys.readouterr().out)
+    document = json.loads(verb(["version", "--json"]).out)
     assert document["shmmap"] == shmmap.__version__
     assert all(re.fullmatch(r"\d+\.\d+", document[name]) for name in ("protocol", "layout"))
     with pytest.raises(SystemExit) as ended:
@@ -158,20 +149,19 @@ def test_version_and_its_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out == f"shmmap {shmmap.__version__}\n"
 
 
-@pytest.mark.parametrize("verb", ["status", "ls", "health"])
+@pytest.mark.parametrize("name", ["status", "ls", "health"])
 def test_no_daemon_is_69_and_says_where_it_looked(
-    verb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    name: str, tmp_path: Path, verb: Verb, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("SHMMAP_INSTANCE", raising=False)
-    assert main([verb, "--shm-dir", str(tmp_path), "--endpoint", "/somewhere/town.sock"]) == 69
-    said = capsys.readouterr()
+    said = verb([name, "--shm-dir", str(tmp_path), "--endpoint", "/somewhere/town.sock"], 69)
     assert said.out == ""
     assert "'town'" in said.err
     assert str(tmp_path) in said.err
 
 
-def test_other_instances_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_other_instances_are_named(tmp_path: Path, verb: Verb) -> None:
     for name in ("shmmap.town.statistics", "shmmap.city.statistics", "shmmap.town.0123456789abcdef"):
         (tmp_path / name).touch()
-    assert main(["status", "--shm-dir", str(tmp_path), "--instance", "twon"]) == 69
-    assert "hint: other instances are there: city, town; name one with --instance" in capsys.readouterr().err
+    said = verb(["status", "--shm-dir", str(tmp_path), "--instance", "twon"], 69).err
+    assert "hint: other instances are there: city, town; name one with --instance" in said

@@ -45,6 +45,17 @@ def test_every_check_says_something_about_this_machine(tmp_path: Path) -> None:
         assert one.advice or one.state == "ok", one
 
 
+def test_what_does_not_apply_is_skipped(ward: Ward) -> None:
+    """Without a daemon, and with a map of files, whose store is never asked."""
+    ward.file("/proc/self/mounts", "")
+    skipped = {one.name: one.fact for one in diagnose(ward.diagnosis(map_path="/maps/town")) if one.skipped}
+    for name in ("reload", "signature", "cells", "cache size", "prefetching"):
+        assert skipped.pop(name) == "no daemon runs"
+    for name in ("link", "credentials", "clock", "versions"):
+        assert skipped.pop(name) == "the map is files"
+    assert set(skipped) == {"disk cache", "live maps", "live disk", "live memory", "ROS bridge"}
+
+
 # --- disk cache ---
 
 
@@ -59,6 +70,8 @@ def test_a_disk_cache_in_order(ward: Ward, monkeypatch: pytest.MonkeyPatch) -> N
     assert found.fact.startswith("/var/town: 9.8 KiB of 1.0 MiB used, ")
     monkeypatch.setenv("CACHE_DIRECTORY", "/var/town")
     assert memory.check_disk_cache(ward.diagnosis(uid=uid)).fact.startswith("/var/town: 9.8 KiB of 8.0 GiB")
+    found = memory.check_disk_cache(ward.diagnosis(uid=uid, cache_dir="/var/town/layers/ab/1.layer"))
+    assert (found.state, found.fact) == ("warn", "/var/town/layers/ab/1.layer is no directory")
 
 
 @pytest.mark.parametrize("mode", [0o775, 0o1777])
@@ -82,12 +95,6 @@ def test_a_disk_cache_of_another_user(ward: Ward, which: str) -> None:
     for name in ("var/town", "var/town/objects"):
         os.chown(ward.root / name, USER, -1)
     assert memory.check_disk_cache(ward.diagnosis(uid=USER, cache_dir="/var/town")).state == "ok"
-
-
-def test_a_disk_cache_that_is_none(ward: Ward) -> None:
-    ward.file("/var/town", "a file")
-    found = memory.check_disk_cache(ward.diagnosis(uid=os.geteuid(), cache_dir="/var/town"))
-    assert (found.state, found.fact) == ("warn", "/var/town is no directory")
 
 
 def test_a_disk_cache_without_room(ward: Ward, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -169,7 +176,6 @@ def test_what_the_processes_use_beside_the_segments(ward: Ward) -> None:
 
 
 def test_the_cache_is_judged_as_status_does(ward: Ward) -> None:
-    assert cells.check_cache(ward.diagnosis()).state == "ok"
     seen = snapshot(refused_over_budget_10min=3, budget_bytes=1 << 20)
     found = cells.check_cache(ward.diagnosis(seen))
     verdict = cache_verdict(seen.counters)
@@ -258,7 +264,6 @@ def test_whether_prefetching_keeps_up(
     found = cells.check_prefetching(ward.diagnosis(seen))
     assert (found.state, found.advice) == (state, advice)
     assert found.fact.startswith(fact)
-    assert cells.check_prefetching(ward.diagnosis()).skipped, "no daemon runs"
 
 
 def test_containers(ward: Ward, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -486,10 +491,6 @@ def test_chunks_of_a_daemon_that_does_not_run_are_no_rubbish(ward: Ward) -> None
     assert daemon.check_leftovers(ward.diagnosis(snapshot())).state == "ok"
 
 
-def test_a_daemon_that_keeps_live_maps_alone_needs_no_map(ward: Ward) -> None:
-    assert access.check_map_access(ward.diagnosis(live=(LiveSettings("lidar"),))).state == "ok"
-
-
 # --- kernel ---
 
 
@@ -563,6 +564,7 @@ def test_maps(tmp_path: Path, ward: Ward) -> None:
     made = make_map(tmp_path / "map", columns=2, rows=1, points=3)
     path = str(made.root)
     assert access.check_map_access(ward.diagnosis()).state == "warn"
+    assert access.check_map_access(ward.diagnosis(live=(LiveSettings("lidar"),))).state == "ok"
     assert access.check_map_access(ward.diagnosis(map_path=str(tmp_path / "none"))).state == "fail"
     assert (
         access.check_map_access(ward.diagnosis(snapshot(), map_path=path)).fact
@@ -606,15 +608,13 @@ def test_a_map_in_a_home_directory(tmp_path: Path, ward: Ward, monkeypatch: pyte
         (snapshot("stopped"), "fail"),
         (snapshot("hung"), "fail"),
         (snapshot(version="0.0.0"), "warn"),
+        (None, "warn"),
     ],
 )
-def test_the_daemon(ward: Ward, seen: Snapshot, state: str) -> None:
-    assert daemon.check_daemon(ward.diagnosis(seen)).state == state
-
-
-def test_statistics_of_others(ward: Ward) -> None:
-    diagnosis = dataclasses.replace(ward.diagnosis(), seen=None, unreadable="no")
-    assert daemon.check_daemon(diagnosis).state == "warn"
+def test_the_daemon(ward: Ward, seen: Snapshot | None, state: str) -> None:
+    """Without its statistics if they are another user's."""
+    diagnosis = dataclasses.replace(ward.diagnosis(), seen=seen, unreadable="no")
+    assert daemon.check_daemon(diagnosis).state == state
 
 
 def test_leftovers(ward: Ward) -> None:
@@ -654,6 +654,7 @@ def test_leftovers(ward: Ward) -> None:
     ],
 )
 def test_logind(ward: Ward, files: dict[str, str], state: str) -> None:
+    assert daemon.check_logind(ward.diagnosis()).state == "ok", "without systemd"
     (ward.root / "run/systemd/system").mkdir(parents=True)
     for name, text in files.items():
         ward.file(name, text)
@@ -661,12 +662,7 @@ def test_logind(ward: Ward, files: dict[str, str], state: str) -> None:
     assert daemon.check_logind(ward.diagnosis(uid=995)).state == "ok"
 
 
-def test_logind_without_systemd(ward: Ward) -> None:
-    assert daemon.check_logind(ward.diagnosis()).state == "ok"
-
-
 def test_reloads(ward: Ward) -> None:
-    assert daemon.check_reload(ward.diagnosis()).state == "ok"
     once = daemon.check_reload(ward.diagnosis(snapshot(reloads=0)))
     assert once.fact == "the map was read once, at the start"
     again = daemon.check_reload(ward.diagnosis(snapshot(reloads=3)))
@@ -710,7 +706,6 @@ def test_the_signature_of_a_published_map(
     problems = verdicts.trust_problems(counters, time.time())
     assert bool(problems) == (says == "expired since" or REFUSAL in counters)
     assert bool(verdicts.signature_lines(counters, time.time())) == bool(counters)
-    assert published.check_signature(ward.diagnosis()).skipped, "no daemon runs"
 
 
 def test_what_has_expired_and_is_refused_is_both_said() -> None:

@@ -8,12 +8,13 @@ from typing import Any
 
 import pytest
 
-from shmmap.doctor.published import check_clock, check_credentials, check_link, check_versions
+from shmmap.doctor.checks import CHECKS
 from shmmap.doctor.store_probe import StoreAnswer
 from shmmap.statistics.counters import REFUSALS
 from tests.unit.doctor.conftest import Ward, snapshot
 
 URL = "s3://maps/town"
+ROWS = ("link", "credentials", "clock", "versions")
 ANSWERS: dict[str, Any] = {
     "answers": True,
     "first_s": 0.012,
@@ -23,22 +24,19 @@ ANSWERS: dict[str, Any] = {
 }
 
 
-def look(ward: Ward, answer: StoreAnswer, *, url: str = URL, **counters: int) -> dict[str, tuple[str, str]]:
+def look(ward: Ward, answer: StoreAnswer, **counters: int) -> dict[str, tuple[str, str]]:
     """State and text of each row."""
     counts = {"published_version": 7, "published_refused": 0, "published_expires_unix_ns": 0}
     counts |= {"published_taken_unix_ns": time.time_ns(), **counters}
-    diagnosis = ward.diagnosis(snapshot(**counts), map_path=url)  # type: ignore[arg-type]
+    diagnosis = ward.diagnosis(snapshot(**counts), map_path=URL)  # type: ignore[arg-type]
     assert diagnosis.seen is not None
     diagnosis.seen.identity = None  # the map is that of the settings
     diagnosis.__dict__["store"] = answer
-    checks = (check_link, check_credentials, check_clock, check_versions)
-    found = [check(diagnosis) for check in checks]
-    return {one.name: ("skip" if one.skipped else one.state, f"{one.fact} -> {one.advice}") for one in found}
-
-
-def test_files_are_skipped(ward: Ward) -> None:
-    found = look(ward, StoreAnswer(error="never asked"), url="/maps/town")
-    assert {state for state, _ in found.values()} == {"skip"}
+    found = {name: CHECKS[name](diagnosis) for name in ROWS}
+    return {
+        name: ("skip" if one.skipped else one.state, f"{one.fact} -> {one.advice}")
+        for name, one in found.items()
+    }
 
 
 def test_all_well(ward: Ward) -> None:

@@ -19,7 +19,6 @@ from shmmap.service import program
 from shmmap.service.file_system import FileSystem
 from shmmap.service.huge_pages import check_possible
 from shmmap.service.installation import (
-    PlannedFile,
     configuration,
     plan_system,
     plan_user,
@@ -31,6 +30,7 @@ from shmmap.service.installation import (
 from shmmap.service.program import Program, command_line, outermost, quoted
 from tests.support.daemon_process import ROOT
 from tests.support.pages import read_page
+from tests.unit.conftest import Verb
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -67,9 +67,13 @@ def paths_in(text: str) -> set[str]:
     return {path for path in found if not path.startswith(("/run", "/dev", "/proc", "/sys", "/var"))}
 
 
-def test_an_image_names_nothing_outside_of_itself(image: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Whichever Python writes it, and wherever the image lies on this machine."""
-    assert main(["unit", "install", "--root", str(image), "--map", "/srv/map"]) == 0
+def test_an_image_names_nothing_outside_of_itself(
+    image: Path, verb: Verb, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whichever Python writes it, and wherever the image lies on this machine; it may be named from here."""
+    monkeypatch.chdir(image.parent)
+    said = verb(["unit", "install", "--root", "image", "--map", "/srv/map"]).out
+    assert "systemctl --root=image enable shmmapd" in said
     written = [path for path in (image / "etc").rglob("*") if path.is_file()]
     assert {str(path.relative_to(image)) for path in written} >= {
         "etc/systemd/system/shmmapd.service",
@@ -92,7 +96,6 @@ def test_an_image_names_nothing_outside_of_itself(image: Path, capsys: pytest.Ca
     assert {path for path in named if there.status(path) is None} <= {"/usr/sbin/nologin", "/"}
     config = tomllib.loads((image / "etc/shmmap/shmmap.toml").read_text())
     assert config == {"map_path": "/srv/map", "group": "shmmap"}
-    assert f"systemctl --root={image} enable shmmapd" in capsys.readouterr().out
     assert {one.action for one in plan_system("/srv/map", str(image))} == {"same", "kept"}
     assert sorted(path.name for path in (image / "etc").rglob(".*")) == []
 
@@ -117,7 +120,7 @@ def test_a_map_of_an_image(image: Path, tmp_path: Path, monkeypatch: pytest.Monk
         assert ("\nBindReadOnlyPaths=/srv/map\n" in drop_in.read_text()) == hidden
 
 
-def test_a_published_map_is_fetched_over_the_network(image: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_published_map_is_fetched_over_the_network(image: Path, verb: Verb) -> None:
     """With the credentials that are there; a map on this machine takes the network away again."""
     drop_in = image / "etc/systemd/system/shmmapd.service.d/25-published-map.conf"
 
@@ -137,12 +140,12 @@ def test_a_published_map_is_fetched_over_the_network(image: Path, capsys: pytest
     }
     assert tomllib.loads(config.read_text())["map_path"] == "s3://maps/town"
     assert not [line for line in install("file:///srv/map") if not line.startswith("#")]
-    assert main(["unit", "install", "--root", str(image), "--map", "s3://key:secret@maps/town"]) == 2
-    assert "secret" not in capsys.readouterr().err.replace("may hold a secret", "")
+    said = verb(["unit", "install", "--root", str(image), "--map", "s3://key:secret@maps/town"], 2).err
+    assert "secret" not in said.replace("may hold a secret", "")
 
 
 def test_a_root_of_trust_is_copied_to_where_the_service_sees_it(
-    image: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    image: Path, tmp_path: Path, verb: Verb, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It may lie in a home directory, which the service does not see; it is public."""
     given = tmp_path / "home" / "ROOT.json"
@@ -150,22 +153,19 @@ def test_a_root_of_trust_is_copied_to_where_the_service_sees_it(
     content = b'{"signatures": [], "signed": {"_type": "root", "text": "\\u00e4 \xc3\xa4"}}\r\n'
     given.write_bytes(content)
     words = ["unit", "install", "--root", str(image), "--map", "s3://maps/town"]
-    assert main([*words, "--trust", str(given)]) == 0
+    verb([*words, "--trust", str(given)])
     copy, config = image / "etc/shmmap/ROOT.json", image / "etc/shmmap/shmmap.toml"
     assert copy.read_bytes() == content
     assert copy.stat().st_mode & 0o777 == 0o644
     assert tomllib.loads(config.read_text())["trust"] == "/etc/shmmap/ROOT.json"
     monkeypatch.chdir(given.parent)
     given.write_bytes(content[:-2])
-    capsys.readouterr()
-    assert main([*words, "--trust", "ROOT.json"]) == 0
+    assert "is kept: set map_path and trust there" in verb([*words, "--trust", "ROOT.json"]).out
     assert copy.read_bytes() == content[:-2]
-    assert "is kept: set map_path and trust there" in capsys.readouterr().out
     assert main(words) == 0
     assert copy.read_bytes() == content[:-2], "an installation without it leaves it there"
     given.write_text("{}")
-    assert main([*words, "--trust", str(given)]) == 78
-    assert "no root of trust" in capsys.readouterr().err
+    assert "no root of trust" in verb([*words, "--trust", str(given)], 78).err
     assert main(["unit", "install", "--root", str(image), "--trust", str(given)]) == 2
     given.write_bytes(content)
     user = {one.path.name: one.text for one in plan_user("s3://maps/town", str(tmp_path), trust=str(given))}
@@ -220,43 +220,28 @@ def test_whatever_lies_where_a_unit_goes(image: Path, tmp_path: Path, what: str)
 
 
 @pytest.mark.parametrize("root", ["", "no/such/directory", "file"])
-def test_a_root_that_is_none(
-    root: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_root_that_is_none(root: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verb: Verb) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("")
-    assert main(["unit", "install", "--root", root]) == 2
-    assert "no directory" in capsys.readouterr().err
+    assert "no directory" in verb(["unit", "install", "--root", root], 2).err
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
-def test_a_root_may_be_named_from_here(image: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(image.parent)
-    assert main(["unit", "install", "--root", "image", "--map", "/srv/map"]) == 0
-    assert (image / "etc/systemd/system/shmmapd.service").is_file()
-
-
-def test_a_program_that_would_not_start_in_the_image(
-    image: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_program_that_would_not_start_in_the_image(image: Path, tmp_path: Path, verb: Verb) -> None:
     """It was made from outside, its Python is not there, others cannot read it, or there is none."""
     script = image / "opt/shmmap/bin/shmmapd"
     words = ["unit", "install", "--root", str(image)]
     executable(script, f"#!{image}/opt/shmmap/bin/python3\n")
-    assert main(words) == 78
-    assert f"run by {image}/opt/shmmap/bin/python3" in capsys.readouterr().err
+    assert f"run by {image}/opt/shmmap/bin/python3" in verb(words, 78).err
     executable(script, "#!/opt/shmmap/bin/python3\n")
     (image / "usr/bin/python3.11").unlink()
-    assert main(words) == 78
-    assert "chroot IMAGE sh -c 'python3 -m venv /opt/shmmap" in capsys.readouterr().err
+    assert "chroot IMAGE sh -c 'python3 -m venv /opt/shmmap" in verb(words, 78).err
     executable(image / "usr/bin/python3.11")
     (image / "opt/shmmap").chmod(0o700)
-    assert main(words) == 78
-    assert "only its owner may read /opt/shmmap" in capsys.readouterr().err
+    assert "only its owner may read /opt/shmmap" in verb(words, 78).err
     (image / "opt/shmmap").chmod(0o755)
     script.unlink()
-    assert main(words) == 78
-    assert "no shmmap is installed below" in capsys.readouterr().err
+    assert "no shmmap is installed below" in verb(words, 78).err
     executable(image / "usr/bin/shmmapd", "#!/usr/bin/python3\n")
     assert main(words) == 0
     unit = (image / "etc/systemd/system/shmmapd.service").read_text()
@@ -288,9 +273,9 @@ def test_units_are_replaced_and_the_configuration_is_kept(image: Path) -> None:
     assert config.read_text() == "mine"
 
 
-def test_huge_pages(image: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_huge_pages(image: Path, verb: Verb) -> None:
     assert not any("huge" in one.path.name for one in plan_system(root=str(image)))
-    assert main(["unit", "install", "--root", str(image), "--huge-pages"]) == 0
+    assert "systemctl stop" not in verb(["unit", "install", "--root", str(image), "--huge-pages"]).out
     units = image / "etc/systemd/system"
     mount = (units / "run-shmmap_huge.mount").read_text()
     assert f"\nWhere={HUGE_PAGES_DIR}\n" in mount
@@ -300,9 +285,8 @@ def test_huge_pages(image: Path, capsys: pytest.CaptureFixture[str]) -> None:
         for line in ("RequiresMountsFor=", "ReadWritePaths=", "Environment=SHMMAP_SHM_DIR="):
             assert f"\n{line}{HUGE_PAGES_DIR}\n" in drop_in
     assert sum("huge" in one.path.name for one in plan_system(root=str(image))) == 3, "an upgrade keeps them"
-    assert "systemctl stop" not in capsys.readouterr().out
-    assert main(["unit", "install", "--user", "--huge-pages", "--dry-run"]) == 2
-    assert "mount -o remount,huge=within_size /dev/shm" in capsys.readouterr().err
+    refused = verb(["unit", "install", "--user", "--huge-pages", "--dry-run"], 2).err
+    assert "mount -o remount,huge=within_size /dev/shm" in refused
 
 
 @pytest.mark.parametrize("switch", ["always within_size advise never [deny] force", ""])
@@ -392,64 +376,34 @@ def test_what_lies_above_does_not_matter_where_the_units_show_it(
             one.check_readable()
 
 
-def test_the_daemon_s_command_starts_the_daemon() -> None:
+@pytest.mark.parametrize(("which", "name"), [("daemon", "shmmap serve"), ("bridge", "shmmap-ros-bridge")])
+def test_a_command_starts_its_program(which: str, name: str) -> None:
     done = subprocess.run(
-        f"exec {command_line(Program.this_one().daemon)} --help",
+        f"exec {command_line(getattr(Program.this_one(), which))} --help",
         shell=True,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "clients")])},
         capture_output=True,
         text=True,
         check=True,
     )
-    assert "usage: shmmap serve" in done.stdout
+    assert f"usage: {name}" in done.stdout
 
 
-def test_the_bridge_s_command_starts_the_bridge() -> None:
-    paths = os.pathsep.join([str(ROOT), str(ROOT / "clients")])
-    done = subprocess.run(
-        f"exec {command_line(Program.this_one().bridge)} --help",
-        shell=True,
-        env={**os.environ, "PYTHONPATH": paths},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert "usage: shmmap-ros-bridge" in done.stdout
-
-
-def test_printing(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["unit", "print"]) == 0
-    assert capsys.readouterr().out == unit_text("system/shmmapd.service")
-    assert main(["unit", "print", "--user", "shmmapd.socket"]) == 0
-    assert capsys.readouterr().out == shipped_text("user/shmmapd.socket")
-    assert main(["unit", "print", "drop-ins/maps-in-home.conf"]) == 0
-    assert "BindReadOnlyPaths=" in capsys.readouterr().out
-    assert main(["unit", "print", "--list"]) == 0
-    assert capsys.readouterr().out.splitlines() == shipped_names()
+def test_printing(verb: Verb) -> None:
+    assert verb(["unit", "print"]).out == unit_text("system/shmmapd.service")
+    assert verb(["unit", "print", "--user", "shmmapd.socket"]).out == shipped_text("user/shmmapd.socket")
+    assert "BindReadOnlyPaths=" in verb(["unit", "print", "drop-ins/maps-in-home.conf"]).out
+    assert verb(["unit", "print", "--list"]).out.splitlines() == shipped_names()
     assert main(["unit", "print", "../pyproject.toml"]) == 2
     with pytest.raises(BadRequest):
         shipped_text("/etc/passwd")
 
 
-def test_a_dry_run_writes_nothing(image: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["unit", "install", "--root", str(image), "--dry-run"]) == 0
-    assert f"new  {image}/etc/shmmap/shmmap.toml" in capsys.readouterr().out
+def test_a_dry_run_writes_nothing(image: Path, verb: Verb) -> None:
+    said = verb(["unit", "install", "--root", str(image), "--dry-run"]).out
+    assert f"new  {image}/etc/shmmap/shmmap.toml" in said
     assert not (image / "etc").exists()
     assert main(["unit", "install", "--root", str(image), "--map", str(image / "none")]) == 66
-
-
-def test_what_cannot_be_written(image: Path) -> None:
-    (image / "etc").write_text("in the way")
-    assert main(["unit", "install", "--root", str(image)]) == 73
-
-
-def test_planned_files_know_what_they_replace(tmp_path: Path) -> None:
-    path = tmp_path / "file"
-    assert PlannedFile(path, "a").action == "new"
-    path.write_text("b")
-    assert PlannedFile(path, "b").action == "same"
-    assert PlannedFile(path, "a").action == "changed"
-    assert PlannedFile(path, "a", keep=True).action == "kept"
 
 
 def test_a_wheel_ships_them() -> None:

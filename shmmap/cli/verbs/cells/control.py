@@ -7,6 +7,7 @@ import argparse
 from typing import TYPE_CHECKING, Final
 
 from shmmap.cli.areas import act_on_cells, add_cells_argument
+from shmmap.cli.daemon_address import connect
 from shmmap.cli.options import Subparsers, add_daemon_options, add_layer_option, add_verb, layers_from
 from shmmap.cli.program import add_allow_empty
 from shmmap.cli.screens.output import Column, counted, format_bytes, print_json, print_line, print_table
@@ -53,8 +54,6 @@ def add_reload(subparsers: Subparsers) -> None:
 
 def run_reload(args: argparse.Namespace) -> int:
     """Reload the map's metadata, and print what changed."""
-    from shmmap.cli.daemon_address import connect
-
     with connect(args) as client:
         answer = client.reload()
     if args.json:
@@ -168,8 +167,6 @@ def add_stop(subparsers: Subparsers) -> None:
 
 def run_stop(args: argparse.Namespace) -> int:
     """Ask the daemon to stop."""
-    from shmmap.cli.daemon_address import connect
-
     with connect(args) as client:
         pid = client.welcome.pid
         client.shutdown()

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from shmmap.cli.areas import add_area_or_ids, area_from, no_cell_there, print_near_cells
+from shmmap.cli.daemon_address import connect
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb, seconds
 from shmmap.cli.program import add_allow_empty, complain, nothing_found
 from shmmap.cli.screens.output import counted, print_json, print_line
@@ -69,7 +70,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write the files of an export."""
-    from shmmap.cli.daemon_address import connect
+    from shmmap.cli.verbs.cells import outputs
 
     area = area_from(args)
     if args.crop and area is None:
@@ -95,12 +96,8 @@ def run(args: argparse.Namespace) -> int:
                 if len(columns["xyz"]):
                     _write(path, columns, kind, args)
                     ids = [cell.id for cell in cells]
-                    from shmmap.cli.verbs.cells import outputs
-
                     written.append(outputs.File(str(path), len(columns["xyz"]), ids))
         if args.json:
-            from shmmap.cli.verbs.cells import outputs
-
             print_json(outputs.Exported(written))
         else:
             for file in written:

@@ -20,6 +20,7 @@ from shmmap.cli.screens.output import (
     print_pairs,
     print_table,
 )
+from shmmap.cli.screens.work_progress import StageProgress
 from shmmap.errors import MapDataError, MapMissing
 
 if TYPE_CHECKING:
@@ -110,7 +111,6 @@ def _described(path: str) -> CloudDescription:
 
 
 def _directory(args: argparse.Namespace) -> int:
-    from shmmap.cli.screens.work_progress import StageProgress
     from shmmap.cli.verbs.cells import outputs
     from shmmap.dividing.inputs import find_inputs
 

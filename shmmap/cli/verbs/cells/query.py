@@ -8,6 +8,7 @@ import re
 from typing import TYPE_CHECKING
 
 from shmmap.cli.areas import add_area_or_ids, area_from, no_cell_there, print_near_cells
+from shmmap.cli.daemon_address import connect
 from shmmap.cli.options import (
     Subparsers,
     add_daemon_options,
@@ -102,8 +103,6 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Request cells and print the answer."""
-    from shmmap.cli.daemon_address import connect
-
     area = area_from(args)
     held_given = args.held is not None
     held = [held_cell(text) for text in args.held or ()]

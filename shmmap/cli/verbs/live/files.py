@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,6 +23,7 @@ from shmmap.cli.screens.output import (
 from shmmap.cli.screens.work_progress import fields_text
 from shmmap.cli.verbs.maps.divide import metres, translation
 from shmmap.errors import BadRequest, ConfigError, MapDataError
+from shmmap.formats.durable_file import writing_errors
 
 if TYPE_CHECKING:
     from shmmap.daemon.live.disk.exporting import ExportedVoxels, Format
@@ -98,7 +100,6 @@ def run_fsck(args: argparse.Namespace) -> int:
     """Check the files, and repair them if requested."""
     from shmmap.daemon.live.disk.maintenance import check, repair
     from shmmap.daemon.live.disk.stored_map import opened_folder, opened_folder_to_read
-    from shmmap.formats.durable_file import writing_errors
 
     path = _directory_from(args)
     if args.read_only:
@@ -216,8 +217,6 @@ def add_export(subparsers: Subparsers) -> None:
 
 def _run_export(args: argparse.Namespace) -> int:
     """Export the map, and print the result."""
-    import time
-
     from shmmap.daemon.live.disk.exporting import export
     from shmmap.daemon.live.disk.stored_map import StoredMap, opened_folder_to_read
 
@@ -301,7 +300,6 @@ def _run_reset(args: argparse.Namespace) -> int:
     """Move the files aside, or delete them."""
     from shmmap.daemon.live.disk.maintenance import files_of_map, reset
     from shmmap.daemon.live.disk.stored_map import opened_folder
-    from shmmap.formats.durable_file import writing_errors
 
     path = _directory_from(args)
     with opened_folder(path, "stop the daemon: it would go on with the files that it knows") as folder:

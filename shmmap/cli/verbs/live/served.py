@@ -7,6 +7,7 @@ import argparse
 import time
 from typing import TYPE_CHECKING
 
+from shmmap.cli.daemon_address import connect
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb
 from shmmap.cli.screens.output import (
     Column,
@@ -63,8 +64,6 @@ def add_ls(subparsers: Subparsers) -> None:
 
 def _run_ls(args: argparse.Namespace) -> int:
     """Print the table of live maps."""
-    from shmmap.cli.daemon_address import connect
-
     with connect(args) as client:
         maps = client.live_maps()
     if args.json:
@@ -151,8 +150,6 @@ def add_show(subparsers: Subparsers) -> None:
 
 def _run_show(args: argparse.Namespace) -> int:
     """Print a live map and its chunks."""
-    from shmmap.cli.daemon_address import connect
-
     with connect(args) as client:
         live = client.live(args.name)
         row, chunks = live.status(), live.chunks(saved=args.saved)
@@ -224,8 +221,6 @@ def add_save(subparsers: Subparsers) -> None:
 
 def _run_save(args: argparse.Namespace) -> int:
     """Request a save, and wait for it."""
-    from shmmap.cli.daemon_address import connect
-
     begin_s = time.monotonic()
     with connect(args) as client:
         files = client.live(args.name).save()

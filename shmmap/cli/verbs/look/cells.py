@@ -8,6 +8,7 @@ import time
 from typing import TYPE_CHECKING
 
 from shmmap.cli.areas import add_area_options, area_from, around, those_in
+from shmmap.cli.daemon_address import connect, snapshot
 from shmmap.cli.options import Subparsers, add_daemon_options, add_statistics_options, add_verb
 from shmmap.cli.program import add_allow_empty, nothing_found
 from shmmap.cli.screens.output import (
@@ -99,7 +100,6 @@ def run_ls(args: argparse.Namespace) -> int:
 
 
 def _list(args: argparse.Namespace) -> int:
-    from shmmap.cli.daemon_address import snapshot
 
     area = area_from(args)
     found, identity = snapshot(args)
@@ -188,8 +188,6 @@ def add_show(subparsers: Subparsers) -> None:
 
 def run_show(args: argparse.Namespace) -> int:
     """Print everything about one cell."""
-    from shmmap.cli.daemon_address import connect
-
     with connect(args) as client:
         try:
             cell = client.show(args.cell)

@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from shmmap.cli.areas import add_area_options, area_from, around, those_in
+from shmmap.cli.daemon_address import connect, snapshot
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb
-from shmmap.cli.program import add_allow_empty, nothing_found
+from shmmap.cli.program import add_allow_empty, nothing_found, write_text
 from shmmap.cli.screens.output import counted, format_bytes, print_hanging, print_line, wants_style
 from shmmap.cli.screens.status_parts import published_words
 from shmmap.doctor.verdicts import outage_so_far
@@ -75,8 +76,6 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Draw the map."""
-    from shmmap.cli.daemon_address import snapshot
-    from shmmap.cli.program import write_text
     from shmmap.cli.screens.map_scene import html_page, svg
 
     area = area_from(args)
@@ -96,22 +95,21 @@ def run(args: argparse.Namespace) -> int:
         if path is not None:
             write_text(path, make(scene))
             print_line(f"wrote {path}")
-    off_the_map = area is not None and scene.empty and everywhere is not None
-    if args.svg is None and args.html is None and not off_the_map:
+    missing = ""
+    if area is not None and scene.empty and everywhere is not None:
+        spans = f"the {'cells in memory span' if silent else 'map spans'} {extent_text(everywhere)}"
+        missing = f"no {what} {area_text(area)}; {spans}"
+    if args.svg is None and args.html is None and not missing:
         _print(scene)
     if found.state == "dead":
         return DaemonUnreachable.exit_code
-    if area is not None and scene.empty and everywhere is not None:
-        spans = f"the {'cells in memory span' if silent else 'map spans'} {extent_text(everywhere)}"
-        return nothing_found(args, f"no {what} {area_text(area)}; {spans}")
-    return 0
+    return nothing_found(args, missing) if missing else 0
 
 
 def _live_scene(
     args: argparse.Namespace, area: Area | None, found: Snapshot
 ) -> tuple[Scene, BoxTuple | None]:
     """Request the chunks of a live map; return the scene and the bounds of all chunks."""
-    from shmmap.cli.daemon_address import connect
     from shmmap.cli.screens.map_scene import Scene, chunk_squares
     from shmmap.geometry import Box
 
@@ -161,7 +159,6 @@ def _scene(
 
 def _on_disk(args: argparse.Namespace, area: Area | None, found: Snapshot, id_prefix: str) -> OnDisk:
     """Request the cells to draw, unless they are too many or the daemon does not reply."""
-    from shmmap.cli.daemon_address import connect
     from shmmap.geometry import Box
 
     nothing = OnDisk([], None, None)

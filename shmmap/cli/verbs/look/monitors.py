@@ -9,6 +9,7 @@ import sys
 import time
 from typing import TYPE_CHECKING
 
+from shmmap.cli.daemon_address import endpoint, has_lost_socket, locate, snapshot
 from shmmap.cli.options import Subparsers, add_statistics_options, add_verb
 from shmmap.cli.screens.output import counted, format_duration, print_hanging, print_json, print_line
 from shmmap.doctor.verdicts import trust_problems
@@ -48,8 +49,6 @@ def add_health(subparsers: Subparsers) -> None:
 
 def run_health(args: argparse.Namespace) -> int:
     """Print the health in one word, with reasons; return the exit code."""
-    from shmmap.cli.daemon_address import has_lost_socket, snapshot
-
     found, identity = snapshot(args)
     troubles = _troubles(found)
     lost = found.state == "healthy" and has_lost_socket(found)
@@ -123,7 +122,6 @@ def add_metrics(subparsers: Subparsers) -> None:
 
 def run_metrics(args: argparse.Namespace) -> int:
     """Print the metrics once."""
-    from shmmap.cli.daemon_address import locate
     from shmmap.statistics.prometheus import exposition
     from shmmap.statistics.reader import read_statistics
 
@@ -161,16 +159,15 @@ def add_doctor(subparsers: Subparsers) -> None:
 
 def run_doctor(args: argparse.Namespace) -> int:
     """Print all findings."""
-    from shmmap.cli import daemon_address
     from shmmap.daemon.config import installed_config_file, load_config
     from shmmap.doctor.checks import diagnose, examine
     from shmmap.doctor.verdicts import worst
 
     file = args.config or installed_config_file()
-    flags = {"instance": args.instance, "endpoint": daemon_address.endpoint(args), "shm_dir": args.shm_dir}
+    flags = {"instance": args.instance, "endpoint": endpoint(args), "shm_dir": args.shm_dir}
     if flags["endpoint"]:
         with contextlib.suppress(NoSocket, ProtocolMismatch):
-            flags["instance"], flags["shm_dir"] = daemon_address.locate(args)
+            flags["instance"], flags["shm_dir"] = locate(args)
     findings = diagnose(examine(load_config(flags, file=file), file))
     if args.json:
         from shmmap.cli.verbs.look import outputs

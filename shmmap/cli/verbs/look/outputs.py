@@ -10,7 +10,7 @@ from typing import Annotated, Literal, TypeAlias, Union, get_args
 import msgspec
 
 from shmmap.cli.json_output import Box, Client, Hex, Holder, LiveMap, Segment, hexed
-from shmmap.cli.screens.status_parts import over_fetch
+from shmmap.cli.screens.status_parts import over_fetch, uptime_s
 from shmmap.cli.screens.top_screen import budget_parts
 from shmmap.cli.verbs.look.tail import HEX_FIELDS
 from shmmap.doctor.verdicts import Finding, cache_verdict
@@ -151,7 +151,7 @@ class Status(msgspec.Struct):
             found.state,
             round(found.beat_age_s, 6),
             identity.pid,
-            round(max(time.time() - identity.started_unix_ns * 1e-9, 0.0), 3),
+            round(uptime_s(identity), 3),
             identity.instance,
             identity.endpoint,
             hexed(identity.epoch),

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from shmmap.cli.areas import moved_by
+from shmmap.cli.daemon_address import connect, snapshot
 from shmmap.cli.options import Subparsers, add_daemon_options, add_statistics_options, add_verb
 from shmmap.cli.screens.output import (
     Column,
@@ -29,6 +30,7 @@ from shmmap.cli.screens.status_parts import (
     published_lines,
     since,
     status_lines,
+    uptime_s,
 )
 from shmmap.doctor.verdicts import cache_verdict, outage_so_far
 from shmmap.errors import DaemonUnreachable
@@ -63,23 +65,21 @@ def add_status(subparsers: Subparsers) -> None:
 
 def run_status(args: argparse.Namespace) -> int:
     """Print the state of the daemon."""
-    from shmmap.cli.daemon_address import snapshot
-
     found, identity = snapshot(args)
     if args.json:
         from shmmap.cli.verbs.look.outputs import Status
 
         print_json(Status.of(found, identity))
     else:
-        uptime_s = max(time.time() - identity.started_unix_ns * 1e-9, 0.0)
-        print_pairs(_status_lines(found, identity, uptime_s))
+        print_pairs(_status_lines(found, identity))
     return DaemonUnreachable.exit_code if found.state == "dead" else 0
 
 
-def _state_text(found: Snapshot, pid: int, uptime_s: float) -> str:
+def _state_text(found: Snapshot, identity: DaemonIdentity) -> str:
+    pid, uptime = identity.pid, format_duration(uptime_s(identity))
     return {
-        "healthy": f"healthy, pid {pid}, up {format_duration(uptime_s)}",
-        "starting": f"starting, pid {pid}, for {format_duration(uptime_s)}: it does not listen yet",
+        "healthy": f"healthy, pid {pid}, up {uptime}",
+        "starting": f"starting, pid {pid}, for {uptime}: it does not listen yet",
         "stopped": f"PAUSED, pid {pid}: continue it with `kill -CONT {pid}`",
         "hung": f"HUNG, pid {pid}: no heartbeat for {format_duration(found.beat_age_s)}",
         "dead": f"DEAD: pid {pid} crashed or was killed; start it again, it keeps the cells in memory",
@@ -108,14 +108,14 @@ def _occasional_lines(count: Mapping[str, int]) -> list[tuple[str, str]]:
     return lines
 
 
-def _status_lines(found: Snapshot, identity: DaemonIdentity, uptime_s: float) -> list[tuple[str, str]]:
+def _status_lines(found: Snapshot, identity: DaemonIdentity) -> list[tuple[str, str]]:
     count = found.counters
     used = count["bytes_resident"] + count["bytes_zombie"] + count["bytes_reserved"]
     budget = count["budget_bytes"]
     share = f" ({100 * used / budget:.0f} %)" if budget else ""
     asked = count["hits"] + count["misses"]
     lines = [
-        ("daemon", _state_text(found, identity.pid, uptime_s)),
+        ("daemon", _state_text(found, identity)),
         ("instance", f"{identity.instance} (shmmap {identity.library_version})"),
         ("endpoint", identity.endpoint),
         ("map", f"{identity.map_path}, {count['map_cells']:,} cells, version {identity.map_version:016x}"),
@@ -211,8 +211,6 @@ def add_clients(subparsers: Subparsers) -> None:
 
 def run_clients(args: argparse.Namespace) -> int:
     """Print the table of clients."""
-    from shmmap.cli.daemon_address import connect
-
     with connect(args) as client:
         stats = client.stats()
     if args.json:

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
+from shmmap.cli.daemon_address import endpoint
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb, seconds
 from shmmap.cli.program import complain
 from shmmap.cli.screens.output import (
@@ -24,7 +25,7 @@ from shmmap.cli.screens.output import (
 from shmmap.statistics.counters import TURN_KINDS
 
 if TYPE_CHECKING:
-    from shmmap.client.event_stream import EventStream, Happening
+    from shmmap.client.event_stream import Happening
 
 __all__ = ["add_parser", "run"]
 
@@ -73,7 +74,6 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print events until interrupted."""
-    from shmmap.cli.daemon_address import endpoint
     from shmmap.client.event_stream import EventStream
 
     follow = sys.stdout.isatty() if args.follow is None else args.follow
@@ -89,15 +89,11 @@ def run(args: argparse.Namespace) -> int:
                 show(happening)
                 sys.stdout.flush()
             elif time.monotonic() - stream.last_message_s > SILENT_S:
-                _wait_for_heartbeat(stream, show)
+                # the daemon sends a heartbeat every second: its silence is reported once
+                complain("shmmap", "no heartbeat from the daemon", "shmmap health")
+                show(stream.next(None))
+                sys.stdout.flush()
     return 0
-
-
-def _wait_for_heartbeat(stream: EventStream, show: Callable[[Happening | None], None]) -> None:
-    """Report once that the daemon, which sends a heartbeat every second, is silent."""
-    complain("shmmap", "no heartbeat from the daemon", "shmmap health")
-    show(stream.next(None))
-    sys.stdout.flush()
 
 
 def _is_me(happening: Happening) -> bool:

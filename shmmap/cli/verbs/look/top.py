@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Final
 
+from shmmap.cli.daemon_address import locate, snapshot
 from shmmap.cli.options import Subparsers, add_statistics_options, add_verb, seconds
 from shmmap.cli.screens.output import print_json, print_line, printable
 from shmmap.errors import DaemonUnreachable
@@ -70,7 +71,6 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Show one screen, or update it until interrupted."""
-    from shmmap.cli.daemon_address import locate, snapshot
     from shmmap.cli.screens.top_screen import screen
     from shmmap.statistics.reader import StatisticsReader
 

@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 import argparse
+import time
 from typing import TYPE_CHECKING, NoReturn
 
 from shmmap.cli.options import Subparsers, add_json_option, add_unit_options, add_verb, numbers, size_bytes
 from shmmap.cli.program import complain
 from shmmap.cli.screens.output import counted, format_bytes
-from shmmap.cli.screens.work_progress import fields_text, print_result
+from shmmap.cli.screens.work_progress import StageProgress, fields_text, print_result
 
 if TYPE_CHECKING:
     from shmmap.dividing.frame import Translation
@@ -115,9 +116,6 @@ def add_divide(subparsers: Subparsers) -> None:
 
 def run_divide(args: argparse.Namespace) -> int:
     """Divide clouds, and print the result."""
-    import time
-
-    from shmmap.cli.screens.work_progress import StageProgress
     from shmmap.dividing.divide import divide
     from shmmap.dividing.settings import DivideSettings
 
@@ -230,9 +228,6 @@ def add_merge(subparsers: Subparsers) -> None:
 
 def run_merge(args: argparse.Namespace) -> int:
     """Merge a map into one cloud, and print the result."""
-    import time
-
-    from shmmap.cli.screens.work_progress import StageProgress
     from shmmap.dividing.merge import merge
 
     began_s = time.monotonic()

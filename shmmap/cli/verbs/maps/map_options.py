@@ -4,11 +4,15 @@
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 from shmmap.cli.options import add_unit_options, at_least
 from shmmap.cli.screens.output import print_line
+from shmmap.cli.screens.work_progress import StageProgress
+from shmmap.errors import BadRequest, ConfigError
+from shmmap.lazy_imports import TO_SIGN, needed_packages
 
 if TYPE_CHECKING:
     from shmmap.cli import json_output
@@ -24,9 +28,11 @@ __all__ = [
     "add_sign_option",
     "add_store_options",
     "add_trust_option",
+    "cache_directory",
     "failure_rows",
     "origin_at",
     "print_failures",
+    "progress_on_stderr",
     "refuse_map_options",
     "signer_at",
     "store_at",
@@ -55,8 +61,6 @@ def add_map_options(parser: argparse.ArgumentParser) -> None:
 
 def refuse_map_options(args: argparse.Namespace, what: str, others: Sequence[str] = ()) -> None:
     """Refuse ``others`` and options for reading files where no file is read; ``what`` is the reason."""
-    from shmmap.errors import BadRequest
-
     for option in ("metadata", "strict", "unit", "vertical_unit", *others):
         if getattr(args, option):
             raise BadRequest(f"--{option.replace('_', '-')} does not go with {what}")
@@ -76,10 +80,20 @@ def origin_at(args: argparse.Namespace, cache_dir: str) -> MapOrigin:
     )
 
 
+def cache_directory(args: argparse.Namespace) -> str:
+    """Return the cache directory from the options."""
+    from shmmap.origin.catalogue_bytes import default_cache_directory
+
+    return os.path.abspath(args.cache_dir or default_cache_directory())
+
+
+def progress_on_stderr(args: argparse.Namespace, unit: str = "cells") -> StageProgress:
+    """Return the progress display, which shows nothing with ``--quiet`` or ``--json``."""
+    return StageProgress(quiet=args.quiet or args.json, unit=unit, scale=1.0)
+
+
 def worker_count(args: argparse.Namespace) -> int:
     """Return the number of processes from the options."""
-    import os
-
     return args.workers or len(os.sched_getaffinity(0))
 
 
@@ -118,8 +132,6 @@ def add_store_options(parser: argparse.ArgumentParser) -> None:
 
 def store_at(url: str, args: argparse.Namespace) -> Store:
     """Open the store at a URL with the options."""
-    from shmmap.lazy_imports import needed_packages
-
     with needed_packages("a published map"):
         from shmmap.origin.remote.opened_store import open_store
         from shmmap.origin.remote.store import may_be_plain
@@ -135,8 +147,6 @@ def add_sign_option(parser: argparse.ArgumentParser) -> None:
 
 def signer_at(store: Store, args: argparse.Namespace, *, make_keys: bool = False) -> MapSigner | None:
     """Return the signer of a map from the options; None if it is not signed."""
-    from shmmap.lazy_imports import TO_SIGN, needed_packages
-
     if args.sign is None:
         return None
     with needed_packages("a signed map", together=TO_SIGN):
@@ -154,12 +164,9 @@ def add_trust_option(group: argparse._ActionsContainer) -> None:
 
 def verified_at(store: Store, args: argparse.Namespace) -> Verified | None:
     """Return the current version, verified by the root of trust; None if no root was given."""
-    import os
-
     if args.trust is None:
         return None
     from shmmap.daemon.config_live import state_directory
-    from shmmap.errors import ConfigError
     from shmmap.origin.remote.store import may_be_plain
     from shmmap.origin.remote.verify_apart import VerifySettings, verify_apart
 

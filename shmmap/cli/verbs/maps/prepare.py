@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import re
+import time
 from typing import TYPE_CHECKING
 
 from shmmap.cli.options import (
@@ -30,14 +31,17 @@ from shmmap.cli.verbs.maps.map_options import (
     add_map_options,
     add_store_options,
     add_trust_option,
+    cache_directory,
     failure_rows,
     origin_at,
     print_failures,
+    progress_on_stderr,
     refuse_map_options,
     store_at,
     verified_at,
     worker_count,
 )
+from shmmap.errors import BadRequest
 
 if TYPE_CHECKING:
     from shmmap.publishing.slicing import Sliced
@@ -102,7 +106,6 @@ def _slice(text: str) -> tuple[int, int]:
 
 def run(args: argparse.Namespace) -> int:
     """Compute the layers, with progress on stderr."""
-    from shmmap.errors import BadRequest
     from shmmap.origin.remote.store import is_published
 
     if not args.layer:
@@ -121,18 +124,13 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _prepare_map(args: argparse.Namespace) -> int:
-    import os
-    import time
 
-    from shmmap.cli.screens.work_progress import StageProgress
-    from shmmap.errors import BadRequest
     from shmmap.layers.spec import canonical_layers
-    from shmmap.origin.catalogue_bytes import default_cache_directory
     from shmmap.prepare.run import prepare_map
 
     if not args.cache_size:
         raise BadRequest("--cache-size 0 keeps no layer", hint="name a size such as 512M or 2G")
-    cache_dir = os.path.abspath(args.cache_dir or default_cache_directory())
+    cache_dir = cache_directory(args)
     began_s = time.monotonic()
     origin = origin_at(args, cache_dir)
     layers = canonical_layers(args.layer)
@@ -143,7 +141,7 @@ def _prepare_map(args: argparse.Namespace) -> int:
         cache_dir=cache_dir,
         cache_bytes=args.cache_size,
         workers=worker_count(args),
-        progress=StageProgress(quiet=args.quiet or args.json, unit="cells", scale=1.0),
+        progress=progress_on_stderr(args),
     )
     seconds = time.monotonic() - began_s
     if args.json:
@@ -184,11 +182,6 @@ def _prepare_map(args: argparse.Namespace) -> int:
 
 
 def _prepare_slice(args: argparse.Namespace) -> int:
-    import os
-    import time
-
-    from shmmap.cli.screens.work_progress import StageProgress
-    from shmmap.origin.catalogue_bytes import default_cache_directory
 
     store = store_at(args.map_path, args)
     from shmmap.publishing.messages import SliceSettings
@@ -207,12 +200,12 @@ def _prepare_slice(args: argparse.Namespace) -> int:
                 store.url,
                 args.insecure_http,
                 args.instance_credentials,
-                os.path.abspath(args.cache_dir or default_cache_directory()),
+                cache_directory(args),
                 args.cache_size,
             ),
             current=verified.current if verified is not None else None,
             workers=worker_count(args),
-            progress=StageProgress(quiet=args.quiet or args.json, unit="cells", scale=1.0),
+            progress=progress_on_stderr(args),
         )
     except KeyboardInterrupt:
         complain("shmmap", "interrupted", "the same command continues")

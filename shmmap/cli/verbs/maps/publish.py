@@ -7,6 +7,8 @@
 from __future__ import annotations
 
 import argparse
+import os
+import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -29,14 +31,17 @@ from shmmap.cli.verbs.maps.map_options import (
     add_map_options,
     add_sign_option,
     add_store_options,
+    cache_directory,
     failure_rows,
     origin_at,
     print_failures,
+    progress_on_stderr,
     refuse_map_options,
     signer_at,
     store_at,
     worker_count,
 )
+from shmmap.errors import BadRequest
 
 if TYPE_CHECKING:
     from shmmap.publishing.publish import Published
@@ -133,10 +138,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _join(args: argparse.Namespace) -> int:
-    import time
-
-    from shmmap.cli.screens.work_progress import StageProgress
-    from shmmap.errors import BadRequest
 
     if args.url is not None:
         raise BadRequest("--join takes no MAP", hint="shmmap publish URL --join RUN")
@@ -149,7 +150,7 @@ def _join(args: argparse.Namespace) -> int:
         store,
         args.join,
         signer=signer_at(store, args, make_keys=True),
-        progress=StageProgress(quiet=args.quiet or args.json, unit="cells", scale=1.0),
+        progress=progress_on_stderr(args),
     )
     seconds = time.monotonic() - began_s
     if args.json:
@@ -186,19 +187,15 @@ def _join(args: argparse.Namespace) -> int:
 
 
 def _publish(args: argparse.Namespace) -> int:
-    import os
-    import time
 
-    from shmmap.cli.screens.work_progress import StageProgress
     from shmmap.layers.spec import canonical_layers
-    from shmmap.origin.catalogue_bytes import default_cache_directory
 
     store = store_at(args.url, args)
     from shmmap.publishing.messages import PublishSettings
     from shmmap.publishing.publish import publish_map
 
     layers = canonical_layers(args.layer) if args.layer else ()
-    cache_dir = os.path.abspath(args.cache_dir or default_cache_directory())
+    cache_dir = cache_directory(args)
     began_s = time.monotonic()
     origin = origin_at(args, cache_dir)
     catalogue = origin.load(fresh=True)
@@ -219,7 +216,7 @@ def _publish(args: argparse.Namespace) -> int:
             workers=worker_count(args),
             resend=args.resend,
             signer=signer,
-            progress=StageProgress(quiet=args.quiet or args.json, unit="cells", scale=1.0),
+            progress=progress_on_stderr(args),
         )
     except KeyboardInterrupt:
         complain("shmmap", "interrupted", "the same command continues")

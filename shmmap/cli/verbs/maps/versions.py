@@ -7,6 +7,8 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import time
 from typing import TYPE_CHECKING
 
 from shmmap.cli.options import Subparsers, add_json_option, add_verb, at_least
@@ -25,10 +27,13 @@ from shmmap.cli.verbs.maps.map_options import (
     add_sign_option,
     add_store_options,
     add_trust_option,
+    cache_directory,
+    progress_on_stderr,
     signer_at,
     store_at,
     verified_at,
 )
+from shmmap.errors import BadRequest, MapMissing
 
 if TYPE_CHECKING:
     from shmmap.origin.remote.map_versions import Current, Entry
@@ -106,9 +111,6 @@ def _days(text: str) -> float:
 
 def run_versions(args: argparse.Namespace) -> int:
     """List versions, or roll back, refresh, rotate or prune."""
-    from shmmap.cli.screens.work_progress import StageProgress
-    from shmmap.errors import BadRequest
-
     if args.keep is not None and not args.prune:
         raise BadRequest("--keep goes with --prune")
     if args.sign is not None and not (args.refresh or args.rollback or args.rotate):
@@ -122,7 +124,7 @@ def run_versions(args: argparse.Namespace) -> int:
     store = store_at(args.url, args)
     signer = signer_at(store, args)
     unit = "objects" if args.prune else "cells"
-    progress = StageProgress(quiet=args.quiet or args.json, unit=unit, scale=1.0)
+    progress = progress_on_stderr(args, unit)
     if args.rollback is not None:
         _roll_back(store, args.rollback, progress, signer, as_json=args.json)
     elif signer is not None and args.rotate:
@@ -210,9 +212,6 @@ def _numbers(versions: list[int]) -> str:
 
 def _find_versions(store: Store, current: Current) -> tuple[list[Entry], dict[int, str]]:
     """Return the entries of all versions found, latest first, and the state of each."""
-    import contextlib
-
-    from shmmap.errors import MapMissing
     from shmmap.origin.remote.map_versions import Entry, earlier_versions, list_entries, read_entry
 
     # a copied map may have no entries
@@ -271,8 +270,6 @@ def _list(store: Store, verified: Verified | None, *, as_json: bool) -> None:
         ],
     )
     if verified is not None:
-        import time
-
         until = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(verified.expires_s))
         print_line(f"version {current.version} is signed, until {until}")
 
@@ -309,13 +306,6 @@ def add_fetch(subparsers: Subparsers) -> None:
 
 def run_fetch(args: argparse.Namespace) -> int:
     """Fetch a version as a divided map, with progress on stderr."""
-    import os
-    import time
-
-    from shmmap.cli.screens.work_progress import StageProgress
-    from shmmap.errors import BadRequest
-    from shmmap.origin.catalogue_bytes import default_cache_directory
-
     if args.trust is not None and args.at is not None:
         raise BadRequest("--at does not go with --trust: only the current version is signed")
     store = store_at(args.url, args)
@@ -324,8 +314,8 @@ def run_fetch(args: argparse.Namespace) -> int:
 
     began_s = time.monotonic()
     verified = verified_at(store, args)
-    progress = StageProgress(quiet=args.quiet or args.json, unit="cells", scale=1.0)
-    cache_dir = os.path.abspath(args.cache_dir or default_cache_directory())
+    progress = progress_on_stderr(args)
+    cache_dir = cache_directory(args)
     made = fetch_map(
         store,
         args.out,

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import os
+from dataclasses import asdict
 from pathlib import Path
 
 from shmmap.cli.options import Subparsers, add_json_option, add_verb
@@ -96,8 +97,6 @@ def run_check(args: argparse.Namespace) -> int:
 
 def run_show(args: argparse.Namespace) -> int:
     """Print every setting and its source."""
-    from dataclasses import asdict
-
     from shmmap.daemon.config import ROWS, installed_config_file, trace_settings
     from shmmap.daemon.config_live import LIVE_ROWS
 

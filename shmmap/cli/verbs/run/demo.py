@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 import os
 import tempfile
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -97,8 +98,6 @@ def _density(text: str) -> float:
 
 def run(args: argparse.Namespace) -> int:
     """Run the demonstration and print its measurements."""
-    import time
-
     from shmmap.cli.screens.demo import print_report, progress_for
     from shmmap.processes.interrupts import signals_interrupt
 

@@ -4,9 +4,7 @@
 from __future__ import annotations
 
 import ast
-import io
 import json
-import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any
@@ -26,17 +24,13 @@ from shmmap.cli.screens.output import (
 )
 from shmmap.cli.screens.picture import CellSquare, Vehicle, top_view_svg
 from shmmap.cli.verbs.look.tail import _print_text
+from tests.unit.cli.screens.conftest import Terminal
 
 HOSTILE = "a\x1b]0;owned\x07\r\n\x9b2J\u202e\udcff\u2028\x00z"
 
 
 def harmless(text: str) -> bool:
     return all(one.isprintable() for line in text.split("\n") for one in line)
-
-
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
 
 
 def test_letters_stay_and_codes_are_shown() -> None:
@@ -58,10 +52,8 @@ def test_whatever_prints_escapes(capsys: pytest.CaptureFixture[str]) -> None:
     assert shown.out.count("\n") == 4
 
 
-def test_tables_and_lines_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TERM", "xterm-256color")
-    monkeypatch.delenv("NO_COLOR", raising=False)
-    monkeypatch.setattr(sys, "stdout", terminal := Terminal())
+def test_tables_and_lines_on_a_terminal(terminal: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdout", terminal)
     print_table((Column("CLIENT"),), [[HOSTILE]])
     print_pairs([("client", HOSTILE)])
     assert "\x1b]0;" not in terminal.getvalue()

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 
 import pytest
@@ -17,12 +16,7 @@ from shmmap.cli.screens.output import (
     print_pairs,
     print_table,
 )
-
-
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
-
+from tests.unit.cli.screens.conftest import Terminal
 
 COLUMNS = (Column("CELL"), Column("POINTS", "right"))
 ROWS = [["0_0.pcd", "7"], ["[red]20_0.pcd", "1,234"]]
@@ -38,11 +32,9 @@ def test_plain_table_is_aligned(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_table_on_a_terminal_is_styled_unless_the_environment_forbids_it(
-    monkeypatch: pytest.MonkeyPatch,
+    terminal: Terminal, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("TERM", "xterm-256color")
-    monkeypatch.delenv("NO_COLOR", raising=False)
-    monkeypatch.setattr("sys.stdout", terminal := Terminal())
+    monkeypatch.setattr("sys.stdout", terminal)
     print_table(COLUMNS, ROWS)
     assert "\x1b[1m" in terminal.getvalue()
     assert "[red]20_0.pcd" in terminal.getvalue(), "names are no markup"
@@ -73,10 +65,9 @@ def test_a_wide_column_takes_no_other_with_it() -> None:
     assert columns_that_fit(columns, rows, 52) == [0, 1]
 
 
+@pytest.mark.usefixtures("terminal")
 def test_a_table_is_never_wider_than_the_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     """A name is folded only where no column is left to leave out."""
-    monkeypatch.setenv("TERM", "xterm-256color")
-    monkeypatch.delenv("NO_COLOR", raising=False)
     for width in range(24, 60):
         monkeypatch.setenv("COLUMNS", str(width))
         monkeypatch.setattr("sys.stdout", terminal := Terminal())
@@ -84,20 +75,20 @@ def test_a_table_is_never_wider_than_the_terminal(monkeypatch: pytest.MonkeyPatc
         assert "town_0_0.pcd" in terminal.getvalue(), f"folded at {width} columns"
 
 
-def test_a_narrow_terminal_shows_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TERM", "xterm-256color")
-    monkeypatch.delenv("NO_COLOR", raising=False)
+def test_a_narrow_terminal_shows_what_is_missing(terminal: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdout", terminal)
     monkeypatch.setenv("COLUMNS", "23")
-    monkeypatch.setattr("sys.stdout", terminal := Terminal())
     print_table(WIDE, WIDE_ROWS)
     assert "town_0_0.pcd" in terminal.getvalue()
     assert "hidden (narrow terminal): X, Y, ID" in terminal.getvalue()
     assert "100" not in terminal.getvalue()
 
 
-def test_long_pairs_go_on_below_themselves_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_long_pairs_go_on_below_themselves_on_a_terminal(
+    terminal: Terminal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.stdout", terminal)
     monkeypatch.setenv("COLUMNS", "30")
-    monkeypatch.setattr("sys.stdout", terminal := Terminal())
     print_pairs([("loads", "16 done, 0 queued, 0 failed"), ("map", "/a/path/longer/than/the/line")])
     assert terminal.getvalue() == (
         "loads  16 done, 0 queued, 0\n"

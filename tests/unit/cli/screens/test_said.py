@@ -37,37 +37,36 @@ def test_what_is_wrong_with_live_maps(capsys: pytest.CaptureFixture[str], event:
     assert said == f"live      {text}\n"
 
 
-def test_cells_that_a_client_had_to_wait_for(capsys: pytest.CaptureFixture[str]) -> None:
-    miss = e.PrefetchMiss(1, 2, 3, 0xAB, 77, "planning", 4, "0_0.pcd", "points")
-    _print_text(miss)
-    said = " ".join(capsys.readouterr().out.split())
-    assert said.endswith("miss planning, pid 77 had to wait for 4 cells, such as 0_0.pcd points")
-    _print_json(miss)
+@pytest.mark.parametrize(
+    ("event", "text", "fields"),
+    [
+        (
+            e.PrefetchMiss(1, 2, 3, 0xAB, 77, "planning", 4, "0_0.pcd", "points"),
+            "miss planning, pid 77 had to wait for 4 cells, such as 0_0.pcd points",
+            {"event": "prefetch_miss", "session": "00000000000000ab", "cells": 4},
+        ),
+        (
+            e.Loaded(1, 2, 3, "0_0.pcd", "points", 4, 4096, 10, 5_000_000),
+            "loaded 0_0.pcd points 4.0 KiB, 10 points, in 5.0 ms",
+            {"event": "loaded", "ahead": False},
+        ),
+        (
+            e.Loaded(1, 2, 3, "0_0.pcd", "points", 4, 4096, 10, 5_000_000, ahead=True),
+            "loaded 0_0.pcd points 4.0 KiB, 10 points, in 5.0 ms, ahead of the clients",
+            {"event": "loaded", "ahead": True},
+        ),
+        (e.LiveChanged(1, 2, 3, "lidar", 77), "", {"event": "live_changed", "map": "lidar", "change": 77}),
+    ],
+)
+def test_events_as_text_and_as_json(
+    capsys: pytest.CaptureFixture[str], event: Any, text: str, fields: dict[str, Any]
+) -> None:
+    """Changes of live maps are printed only as JSON."""
+    _print_text(event)
+    assert " ".join(capsys.readouterr().out.split()[1:]) == text
+    _print_json(event)
     document = json.loads(capsys.readouterr().out)
-    assert (document["event"], document["session"], document["cells"]) == (
-        "prefetch_miss",
-        "00000000000000ab",
-        4,
-    )
-
-
-@pytest.mark.parametrize("ahead", [False, True])
-def test_cells_that_were_fetched_ahead(capsys: pytest.CaptureFixture[str], ahead: bool) -> None:
-    loaded = e.Loaded(1, 2, 3, "0_0.pcd", "points", 4, 4096, 10, 5_000_000, ahead=ahead)
-    _print_text(loaded)
-    said = " ".join(capsys.readouterr().out.split())
-    assert said.endswith("in 5.0 ms" + ", ahead of the clients" * ahead)
-    _print_json(loaded)
-    assert json.loads(capsys.readouterr().out)["ahead"] is ahead
-
-
-def test_changes_of_live_maps_are_printed_only_as_json(capsys: pytest.CaptureFixture[str]) -> None:
-    changed = e.LiveChanged(1, 2, 3, "lidar", 77)
-    _print_text(changed)
-    assert capsys.readouterr().out == ""
-    _print_json(changed)
-    document = json.loads(capsys.readouterr().out)
-    assert (document["event"], document["map"], document["change"]) == ("live_changed", "lidar", 77)
+    assert document | fields == document
 
 
 FULL = "the budget of 1.0 MiB is in use"
@@ -84,31 +83,35 @@ def refused(name: str, *holders: Holder, message: str = FULL) -> CellError:
     return OverBudget(f"{path} (points): {message}", cell_id=path, layer="points", holders=holders)
 
 
-def test_one_line_a_cause_and_each_holder_once() -> None:
-    failed: list[CellError] = [refused(f"{x}_0.pcd", NDT, ASKER, UNKNOWN) for x in range(36)]
-    failed.append(LoadFailed("/map/bad.pcd (points): cut off", cell_id="/map/bad.pcd", layer="points"))
-    assert failure_lines(failed) == [
-        f"failed: 36 cells (points): {FULL} [over_budget]: 0_0.pcd, 1_0.pcd, 2_0.pcd, ...",
-        "  in use: 900 KiB in 30 cells by ndt, pid 42",
-        "  in use: 2.0 KiB in 1 cell by a process that did not open them through the client library",
-        "failed: /map/bad.pcd (points): cut off [load_failed]",
-    ]
+def unreadable(reason: str) -> CellError:
+    return LoadFailed(f"/map/bad.pcd (points): {reason}", cell_id="/map/bad.pcd", layer="points")
 
 
-def test_a_path_is_printed_once() -> None:
-    message = "/map/bad.pcd (points): /map/bad.pcd: cut off"
-    failed = LoadFailed(message, cell_id="/map/bad.pcd", layer="points")
-    assert failure_lines([failed]) == ["failed: /map/bad.pcd (points): cut off [load_failed]"]
-
-
-def test_a_client_that_holds_nothing_is_not_listed() -> None:
-    assert failure_lines([refused("a.pcd", ASKER)]) == [f"failed: /map/a.pcd (points): {FULL} [over_budget]"]
-
-
-def test_different_causes_are_different_lines() -> None:
-    lines = failure_lines([refused("a.pcd"), refused("b.pcd"), refused("c.pcd", message="too large")])
-    assert len(lines) == 2
-    assert "2 cells" in lines[0]
+@pytest.mark.parametrize(
+    ("failed", "lines"),
+    [
+        (
+            [*(refused(f"{x}_0.pcd", NDT, ASKER, UNKNOWN) for x in range(36)), unreadable("cut off")],
+            [
+                f"failed: 36 cells (points): {FULL} [over_budget]: 0_0.pcd, 1_0.pcd, 2_0.pcd, ...",
+                "  in use: 900 KiB in 30 cells by ndt, pid 42",
+                "  in use: 2.0 KiB in 1 cell by a process that did not open them through the client library",
+                "failed: /map/bad.pcd (points): cut off [load_failed]",
+            ],
+        ),
+        (
+            [refused("a.pcd", ASKER), refused("b.pcd"), refused("c.pcd", message="too large")],
+            [
+                f"failed: 2 cells (points): {FULL} [over_budget]: a.pcd, b.pcd",
+                "failed: /map/c.pcd (points): too large [over_budget]",
+            ],
+        ),
+        ([unreadable("/map/bad.pcd: cut off")], ["failed: /map/bad.pcd (points): cut off [load_failed]"]),
+    ],
+)
+def test_one_line_a_cause_and_each_holder_once(failed: list[CellError], lines: list[str]) -> None:
+    """A client that holds nothing is not listed; a path is printed once."""
+    assert failure_lines(failed) == lines
 
 
 def test_holders_in_json() -> None:

@@ -9,11 +9,7 @@ import time
 import pytest
 
 from shmmap.cli.screens.work_progress import StageProgress
-
-
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
+from tests.unit.cli.screens.conftest import Terminal
 
 
 def test_part_rate_and_time_left(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from shmmap.cli.entry import main
+from tests.unit.conftest import Verb
 
 
 @pytest.fixture(autouse=True)
@@ -18,15 +19,12 @@ def nothing_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.delenv(name, raising=False)
 
 
-def test_from_init_to_check(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_from_init_to_check(tmp_path: Path, verb: Verb) -> None:
     file = tmp_path / "shmmap.toml"
     assert main(["config", "init", str(file), "--map", str(tmp_path)]) == 0
-    assert main(["config", "check", str(file)]) == 0
-    assert capsys.readouterr().out.endswith(f"{file}: good\n")
-    assert main(["config", "check", "--json", str(file)]) == 0
-    assert json.loads(capsys.readouterr().out) == {"file": str(file), "good": True}
-    assert main(["config", "init", str(file)]) == 2
-    assert f"{file} exists" in capsys.readouterr().err
+    assert verb(["config", "check", str(file)]).out.endswith(f"{file}: good\n")
+    assert json.loads(verb(["config", "check", "--json", str(file)]).out) == {"file": str(file), "good": True}
+    assert f"{file} exists" in verb(["config", "init", str(file)], 2).err
     assert main(["config", "init", str(tmp_path / "none" / "x.toml")]) == 73
 
 
@@ -46,34 +44,29 @@ def test_from_init_to_check(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
         ("map_path = 's3://maps/town'\ntrust = true", 78, ":2: trust must be text"),
     ],
 )
-def test_mistakes(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, code: int, says: str
-) -> None:
+def test_mistakes(tmp_path: Path, verb: Verb, text: str, code: int, says: str) -> None:
     file = tmp_path / "shmmap.toml"
     file.write_text(text)
-    assert main(["config", "check", str(file)]) == code
-    assert says in capsys.readouterr().err
+    assert says in verb(["config", "check", str(file)], code).err
 
 
-def test_show(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_show(tmp_path: Path, verb: Verb, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "config" / "shmmap" / "shmmap.toml"
     file.parent.mkdir(parents=True)
     file.write_text("# mine\nmap_path = '/maps/\"new\"'\n")
     monkeypatch.setenv("SHMMAP_BUDGET", "1M")
-    assert main(["config", "show"]) == 0  # the installed one
-    plain = capsys.readouterr().out.splitlines()
+    plain = verb(["config", "show"]).out.splitlines()  # the installed one
     assert 'map_path = "/maps/\\"new\\""' in plain
     assert "strict = false" in plain
-    assert main(["config", "show", "--origin", str(file)]) == 0
-    origins = dict(line.split("  # ") for line in capsys.readouterr().out.splitlines())
+    with_origins = verb(["config", "show", "--origin", str(file)]).out.splitlines()
+    origins = dict(line.split("  # ") for line in with_origins)
     traced = {name.split(" = ")[0]: origin for name, origin in origins.items()}
     assert (traced["map_path"], traced["budget"], traced["strict"]) == (
         f"{file}:2",
         "SHMMAP_BUDGET",
         "default",
     )
-    assert main(["config", "show", "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
+    found = json.loads(verb(["config", "show", "--json"]).out)
     assert found["file"] == str(file)
     for name in ("budget", "budget_bytes"):
         assert found["settings"][name] == {"value": 1 << 20, "origin": "SHMMAP_BUDGET"}

@@ -14,6 +14,7 @@ import pytest
 from shmmap.cli.entry import main
 from shmmap.formats.cloud import read_cloud
 from shmmap.formats.pcd.writer import write_pcd
+from tests.unit.conftest import Verb
 
 
 def cloud(path: Path, corner: float, count: int = 10) -> Path:
@@ -30,12 +31,11 @@ def cloud(path: Path, corner: float, count: int = 10) -> Path:
     return path
 
 
-def test_a_directory_is_a_line_a_file_and_totals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_directory_is_a_line_a_file_and_totals(tmp_path: Path, verb: Verb) -> None:
     cloud(tmp_path / "map" / "a.pcd", 0)
     cloud(tmp_path / "map" / "inner" / "b.pcd", 100, 20)
     (tmp_path / "map" / "notes.txt").write_text("no cloud")
-    assert main(["inspect", str(tmp_path / "map")]) == 0
-    lines = capsys.readouterr().out.splitlines()
+    lines = verb(["inspect", str(tmp_path / "map")]).out.splitlines()
     assert lines[0].split() == ["FILE", "FORMAT", "SIZE", "POINTS", "NOT", "FINITE", "X", "Y", "Z", "FIELDS"]
     assert re.match(
         r"a\.pcd\s+pcd binary\s.*\s10\s+0\s+0 \.\. 9\s+0 \.\. 9\s+0 \.\. 0\.9\s+x y z "
@@ -45,20 +45,18 @@ def test_a_directory_is_a_line_a_file_and_totals(tmp_path: Path, capsys: pytest.
     assert lines[2].startswith("inner/b.pcd ")
     assert [line.split(maxsplit=1) for line in lines[4:6]] == [["files", "2"], ["points", "30"]]
     assert "x       0.000 .. 119.000 m (119.000 m)" in lines
-    assert main(["inspect", "--json", str(tmp_path / "map")]) == 0
-    found = json.loads(capsys.readouterr().out)
+    found = json.loads(verb(["inspect", "--json", str(tmp_path / "map")]).out)
     assert (found["points"], found["dropped"], found["failed"]) == (30, 0, [])
     assert found["bounds"]["max"] == [119.0, 19.0, pytest.approx(1.9)]
     assert [Path(one["path"]).name for one in found["files"]] == ["a.pcd", "b.pcd"]
-    assert main(["inspect", "--json", str(tmp_path / "map" / "a.pcd")]) == 0
-    assert found["files"][0] == json.loads(capsys.readouterr().out) | {"path": found["files"][0]["path"]}
+    alone = json.loads(verb(["inspect", "--json", str(tmp_path / "map" / "a.pcd")]).out)
+    assert found["files"][0] == alone | {"path": found["files"][0]["path"]}
 
 
-def test_a_broken_file_costs_itself(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_broken_file_costs_itself(tmp_path: Path, verb: Verb) -> None:
     cloud(tmp_path / "a.pcd", 0)
     (tmp_path / "bad.pcd").write_bytes(b"\0" * 100)
-    assert main(["inspect", str(tmp_path)]) == 65
-    said = capsys.readouterr()
+    said = verb(["inspect", str(tmp_path)], 65)
     assert "a.pcd" in said.out
     assert "1, 1 that cannot be read" in said.out
     assert said.err.startswith("shmmap: ")
@@ -67,40 +65,35 @@ def test_a_broken_file_costs_itself(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert main(["inspect", str(tmp_path / "none")]) == 66
 
 
-def test_nothing_in_it_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_nothing_in_it_is_said(tmp_path: Path, verb: Verb) -> None:
     empty = tmp_path / "only" / "empty.pcd"
     cloud(empty, 0, 0)
     for path, what in ((empty, "it has no points"), (empty.parent, "no finite point in 1 file")):
-        assert main(["inspect", str(path)]) == 1
-        assert capsys.readouterr().err == f"shmmap: {path}: {what}\n"
-        assert main(["inspect", "--allow-empty", str(path)]) == 0
-        capsys.readouterr()
+        assert verb(["inspect", str(path)], 1).err == f"shmmap: {path}: {what}\n"
+        verb(["inspect", "--allow-empty", str(path)])
     write_pcd(empty, {axis: np.full(3, np.nan, np.float32) for axis in "xyz"})
-    assert main(["inspect", str(empty)]) == 1
-    assert "none of its 3 points is finite" in capsys.readouterr().err
+    assert "none of its 3 points is finite" in verb(["inspect", str(empty)], 1).err
     for words in (
         ["divide", str(empty), str(tmp_path / "map")],
         ["divide", str(empty.parent), str(tmp_path / "map")],
     ):
-        assert main([*words, "--quiet"]) == 65
+        verb([*words, "--quiet"], 65)
     cloud(empty, 0, 0)
-    assert main(["merge", str(empty), str(tmp_path / "out.pcd")]) == 65
-    assert "no point in any of the inputs" in capsys.readouterr().err
+    assert "no point in any of the inputs" in verb(["merge", str(empty), str(tmp_path / "out.pcd")], 65).err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["only"]
 
 
-def test_fields_are_chosen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_fields_are_chosen(tmp_path: Path, verb: Verb) -> None:
     cloud(tmp_path / "in" / "a.pcd", 0)
     words = ["divide", str(tmp_path / "in"), str(tmp_path / "map"), "--quiet", "--json"]
-    assert main([*words, "--fields", "x,y,z", "--fields", "ring"]) == 0
-    assert [name for name, _ in json.loads(capsys.readouterr().out)["fields"]] == ["x", "y", "z", "ring"]
+    made = json.loads(verb([*words, "--fields", "x,y,z", "--fields", "ring"]).out)
+    assert [name for name, _ in made["fields"]] == ["x", "y", "z", "ring"]
     (cell,) = (tmp_path / "map" / "pointcloud_map.pcd").iterdir()
     columns = read_cloud(cell).columns
     assert list(columns) == ["xyz", "ring"]
     assert sorted(columns["ring"].tolist()) == list(range(10))
     for fields, said in (("x,y,intensity", "lack z"), ("x,y,z,colour", "no input has a field colour")):
-        assert main([*words, "--force", "--fields", fields]) == 2
-        assert said in capsys.readouterr().err
+        assert said in verb([*words, "--force", "--fields", fields], 2).err
     # what one input lacks is no hindrance if it is not wanted
     write_pcd(tmp_path / "in" / "b.pcd", {axis: np.ones(2, np.float32) for axis in "xyz"})
     assert main([*words, "--force"]) == 65
