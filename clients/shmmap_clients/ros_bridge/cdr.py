@@ -11,7 +11,7 @@ import struct
 from collections.abc import Callable, Iterable
 from typing import Final
 
-__all__ = ["MAX_BYTES", "CdrWriter", "Content"]
+__all__ = ["MAX_BYTES", "CdrWriter", "Content", "copy_into"]
 
 MAX_BYTES: Final = 2**31 - 1
 """Largest sample that CycloneDDS sends (``Internal/MaxSampleSize``), 2 GiB; its lengths have 32 bits."""
@@ -27,6 +27,11 @@ class Content(bytearray):
     def ljust(self, width: int, fill: bytes = b"\0") -> Content:  # type: ignore[override]
         """Return this object, if it is long enough."""
         return self if len(self) >= width else Content(super().ljust(width, fill))
+
+
+def copy_into(place: memoryview, data: bytearray | memoryview) -> None:
+    """Copy bytes to their place in a sample, as the ``fill`` of a `CdrWriter.blob`."""
+    place[:] = data
 
 
 class CdrWriter:

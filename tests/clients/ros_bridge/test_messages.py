@@ -16,11 +16,11 @@ pytest.importorskip("cyclonedds", reason="needs the package cyclonedds")
 from shmmap_clients.ros_bridge import cdr
 from shmmap_clients.ros_bridge.cdr import CdrWriter, Content
 from shmmap_clients.ros_bridge.messages import (
+    DIFFERENTIAL,
+    OCCUPIED,
     CellMetaData,
     CellWithID,
     Damaged,
-    GetDifferentialResponse,
-    GetOccupiedResponse,
     Header,
     PointCloud2,
     PointField,
@@ -73,8 +73,7 @@ def clouds(draw: st.DrawFn) -> tuple[dict[str, Any], PointCloud2]:
 
 def write(writer: CdrWriter, columns: dict[str, Any], like: PointCloud2) -> None:
     stamp_ns = like.header.stamp.sec * 10**9 + like.header.stamp.nanosec
-    layout = cloud_layout(columns)
-    write_cloud(writer, columns, (0.0, 0.0, 0.0), layout, like.header.frame_id, stamp_ns)
+    write_cloud(writer, columns, (0.0, 0.0, 0.0), like.header.frame_id, stamp_ns)
 
 
 @SETTINGS
@@ -100,7 +99,7 @@ def test_a_reply_is_written_as_the_serializer_does(
     box = (-1.5, 2.0, 18.5, 22.0)
     listed = [CellWithID(name, message, CellMetaData(*box)) for name, (_, message) in cells]
     header = Header(Time(0, 0), "map")
-    wanted = GetDifferentialResponse(client, -7, header, listed, removed).serialize(use_version_2=False)
+    wanted = DIFFERENTIAL.reply(client, -7, header, listed, removed).serialize(use_version_2=False)
     writer = CdrWriter()
     writer.uint64(client)
     writer.int64(-7)
@@ -122,7 +121,7 @@ def _put(place: memoryview, data: bytes) -> None:
 
 def test_numbers_of_eight_bytes_stand_where_they_should() -> None:
     grid = VoxelGrid(Header(Time(1, 2), "m"), 0.2, [1, 2, 3], [4, 5, 6], [-7, 8, 9], 3, 1, 4, -7, 3, 6, 9)
-    wanted = GetOccupiedResponse(1, 2, grid, 3, 17, 0.5, 1.25, True).serialize(use_version_2=False)
+    wanted = OCCUPIED.reply(1, 2, grid, 3, 17, 0.5, 1.25, True).serialize(use_version_2=False)
     writer = CdrWriter()
     writer.uint64(1)
     writer.int64(2)
