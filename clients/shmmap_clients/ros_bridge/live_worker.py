@@ -54,38 +54,32 @@ def _voxel_reply(live: LiveMap, message: Any, kind: str, scope: str) -> Content:
     indices = np.floor(xyz / live.resolution).astype(np.int32)
     writer = _head(live, message, indices)
     count = len(indices)
-    writer.uint64(count, sum(row.active for row in rows))
+    active = sum(row.active for row in rows)
+    ratio = occupied / (occupied + free) if occupied + free else 0.0
     taken = status.file_bytes if scope == "disk" else status.bytes
-    writer.float32(occupied / (occupied + free) if occupied + free else 0.0, taken / 2**20)
-    writer.boolean(True)
+    writer.numbers("QQff?", count, active, ratio, taken / 2**20, True)
     return writer.content()
 
 
 def _failed_reply(message: Any) -> Content:
     """Return a reply without voxels that reports failure."""
     writer = _head(None, message, np.empty((0, 3), np.int32))
-    writer.uint64(0, 0)
-    writer.float32(0.0, 0.0)
-    writer.boolean(False)
+    writer.numbers("QQff?", 0, 0, 0.0, 0.0, False)
     return writer.content()
 
 
 def _head(live: LiveMap | None, message: Any, indices: NDArray[np.int32]) -> CdrWriter:
     """Write a reply up to the end of its ``bonxai_msgs/VoxelGrid``."""
     writer = CdrWriter()
-    writer.uint64(message.client)
-    writer.int64(message.number)
     now_ns = time.time_ns() if live is not None else 0
-    writer.int32(now_ns // 10**9)
-    writer.uint32(now_ns % 10**9)
+    writer.numbers("QqiI", message.client, message.number, now_ns // 10**9, now_ns % 10**9)
     writer.text(live.frame_id if live is not None else "")
-    writer.float64(live.resolution if live is not None else 0.0)
+    writer.numbers("d", live.resolution if live is not None else 0.0)
     for values in np.ascontiguousarray(indices.T):
-        writer.uint32(len(values))
+        writer.numbers("I", len(values))
         writer.blob(values.nbytes, partial(copy_into, data=values.view(np.uint8).data))
-    writer.uint32(len(indices))
-    for ends in (indices.min(axis=0), indices.max(axis=0)) if len(indices) else ((0, 0, 0), (0, 0, 0)):
-        writer.int32(*(int(one) for one in ends))
+    low, high = (indices.min(axis=0), indices.max(axis=0)) if len(indices) else ((0, 0, 0), (0, 0, 0))
+    writer.numbers("Iiiiiii", len(indices), *low, *high)
     return writer
 
 

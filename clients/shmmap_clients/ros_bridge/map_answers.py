@@ -85,13 +85,12 @@ class Catalogue:
     def message(self, frame_id: str, stamp_ns: int) -> Content:
         """Return the list of cells as ``autoware_map_msgs/PointCloudMapMetaData``."""
         writer = CdrWriter()
-        writer.int32(stamp_ns // 10**9)
-        writer.uint32(stamp_ns % 10**9)
+        writer.numbers("iI", stamp_ns // 10**9, stamp_ns % 10**9)
         writer.text(frame_id)
-        writer.uint32(len(self.cells))
+        writer.numbers("I", len(self.cells))
         for cell in self.cells.values():
             writer.text(cell.id)
-            writer.float32(*cell.box)
+            writer.numbers("ffff", *cell.box)
         return writer.content()
 
 
@@ -375,10 +374,7 @@ class MapAnswers:
 
     def _reply(self, message: Any, cells: Iterable[Cell], removed: Collection[str] | None = None) -> Content:
         writer = CdrWriter()
-        writer.uint64(message.client)
-        writer.int64(message.number)
-        writer.int32(0)
-        writer.uint32(0)
+        writer.numbers("QqiI", message.client, message.number, 0, 0)
         writer.text(self._client.welcome.frame_id)
         self._write_cells(writer, self._recent.kept(cells))
         if isinstance(message, DIFFERENTIAL.request):
@@ -392,11 +388,11 @@ class MapAnswers:
 
     def _write_cells(self, writer: CdrWriter, cells: Sequence[Cell]) -> None:
         """Append cells with their points, a sequence of ``autoware_map_msgs/PointCloudMapCellWithID``."""
-        writer.uint32(len(cells))
+        writer.numbers("I", len(cells))
         for cell in cells:
             writer.text(cell.id)
             write_cloud(writer, cell.columns, cell.origin)
-            writer.float32(*cell.box)
+            writer.numbers("ffff", *cell.box)
             if writer.size > MAX_BYTES:  # stop early: thousands of repetitions take long
                 raise TooLarge(
                     f"an answer of more than {MAX_BYTES} bytes", hint="ask for fewer cells at once"

@@ -85,10 +85,10 @@ def _whole_map(
     layout = layout or cloud_layout({})
     writer = CdrWriter()
     write_cloud_head(writer, layout, points, client.welcome.frame_id, stamp_ns)
-    writer.uint32(len(data))
+    writer.numbers("I", len(data))
     if data:
         writer.blob(len(data), partial(copy_into, data=data))
-    writer.boolean(True)
+    writer.numbers("?", True)
     return writer.content()
 
 

@@ -76,14 +76,13 @@ def _layout(kinds: tuple[tuple[str, str, int], ...]) -> CloudLayout:
         places.append((name, offset, np.dtype(f"<{kind}"), count))
         offset += int(kind[1:]) * count
     writer = CdrWriter()
-    writer.uint32(len(fields))
+    writer.numbers("I", len(fields))
     for name, start, datatype, count in fields:
         writer.text(name)
-        writer.uint32(start)
-        writer.uint8(datatype)
-        writer.uint32(count)
-    writer.boolean(False)  # is_bigendian
-    writer.uint32(offset)
+        writer.numbers("IB", start, datatype)
+        writer.numbers("I", count)
+    writer.numbers("?", False)  # is_bigendian
+    writer.numbers("I", offset)
     return CloudLayout(tuple(fields), tuple(places), offset, bytes(writer.content()[4:]))
 
 
@@ -108,22 +107,21 @@ def write_cloud(
     layout, points = cloud_layout(columns), len(columns["xyz"])
     nbytes = points * layout.point_step
     write_cloud_head(writer, layout, points, frame_id, stamp_ns)
-    writer.uint32(nbytes)
+    writer.numbers("I", nbytes)
     if nbytes:
         writer.blob(nbytes, partial(fill_rows, columns=columns, origin=origin, layout=layout))
-    writer.boolean(True)  # is_dense: every coordinate is finite
+    writer.numbers("?", True)  # is_dense: every coordinate is finite
 
 
 def write_cloud_head(
     writer: CdrWriter, layout: CloudLayout, points: int, frame_id: str = "", stamp_ns: int = 0
 ) -> None:
     """Append the part before the points: header, size, fields."""
-    writer.int32(stamp_ns // 10**9)
-    writer.uint32(stamp_ns % 10**9)
+    writer.numbers("iI", stamp_ns // 10**9, stamp_ns % 10**9)
     writer.text(frame_id)
-    writer.uint32(1, points)  # height, width
+    writer.numbers("II", 1, points)  # height, width
     writer.prepared(layout.described)
-    writer.uint32(layout.point_step * points)
+    writer.numbers("I", layout.point_step * points)
 
 
 def fill_rows(
