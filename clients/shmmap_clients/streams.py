@@ -16,8 +16,7 @@ __all__ = ["Publisher", "Subscriber", "is_endpoint"]
 
 _REPEAT_MS: Final = 100  # between two repetitions of the end
 
-_Publisher = TypeVar("_Publisher", bound="Publisher")
-_Subscriber = TypeVar("_Subscriber", bound="Subscriber")
+_Self = TypeVar("_Self", bound="_Endpoint")
 
 
 def is_endpoint(text: str) -> bool:
@@ -25,7 +24,28 @@ def is_endpoint(text: str) -> bool:
     return "://" in text
 
 
-class Publisher:
+class _Endpoint:
+    """A socket of its own kind, in a context of its own."""
+
+    def __init__(self, kind: int) -> None:
+        self._context = zmq.Context()
+        self._socket: zmq.Socket[bytes] = self._context.socket(kind)
+
+    def __enter__(self: _Self) -> _Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+        self._context.term()
+
+
+class Publisher(_Endpoint):
     """Publisher that binds an endpoint and sends to all subscribers.
 
     Parameters
@@ -44,8 +64,7 @@ class Publisher:
     """
 
     def __init__(self, endpoint: str, *, queue: int, linger_ms: int) -> None:
-        self._context = zmq.Context()
-        self._socket = self._context.socket(zmq.XPUB)
+        super().__init__(zmq.XPUB)
         self._socket.sndhwm = queue
         self._socket.linger = self._linger_ms = linger_ms
         self._has_subscriber = False
@@ -56,14 +75,6 @@ class Publisher:
             self.close()
             raise BadRequest(f"cannot bind {endpoint}: {error}") from None
         self.endpoint: str = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
-
-    def __enter__(self: _Publisher) -> _Publisher:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def wait_for_subscriber(self, timeout_s: float) -> bool:
         """Wait for the first subscriber; return False on timeout."""
@@ -97,15 +108,14 @@ class Publisher:
                 break
             self._socket.send_multipart(self._last)  # in case a slow reader has missed it
             self._socket.poll(_REPEAT_MS)
-        self._socket.close()
-        self._context.term()
+        super().close()
 
     def _read_subscription(self) -> None:
         """Record the arrival of the first subscriber, or the departure of the last one."""
         self._has_subscriber = self._socket.recv()[:1] == b"\1"
 
 
-class Subscriber:
+class Subscriber(_Endpoint):
     """Subscriber to all messages that a publisher sends from now on.
 
     Parameters
@@ -122,8 +132,7 @@ class Subscriber:
     """
 
     def __init__(self, endpoint: str, *, queue: int) -> None:
-        self._context = zmq.Context()
-        self._socket = self._context.socket(zmq.SUB)
+        super().__init__(zmq.SUB)
         self._socket.rcvhwm = queue
         self._socket.linger = 0
         try:
@@ -132,14 +141,6 @@ class Subscriber:
             self.close()
             raise BadRequest(f"cannot connect to {endpoint}: {error}") from None
         self._socket.subscribe(b"")
-
-    def __enter__(self: _Subscriber) -> _Subscriber:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     @property
     def closed(self) -> bool:
@@ -153,8 +154,3 @@ class Subscriber:
     def receive(self) -> list[bytes]:
         """Wait for the next message, and return its frames."""
         return self._socket.recv_multipart()
-
-    def close(self) -> None:
-        """Unsubscribe."""
-        self._socket.close()
-        self._context.term()

@@ -46,20 +46,18 @@ from shmmap_clients.ros_bridge.service_server import ServiceServer
 def of_size(size):
     "A reply of one cell with about this many bytes."
     writer = CdrWriter()
-    writer.uint64(0, 0)
-    writer.int32(0, 0)
+    writer.numbers("QQii", 0, 0, 0, 0)
     writer.text("map")
-    writer.uint32(1)
+    writer.numbers("I", 1)
     writer.text("cell")
-    writer.int32(0, 0)
+    writer.numbers("ii", 0, 0)
     writer.text("")
-    writer.uint32(1, 1, 0)
-    writer.boolean(False)
+    writer.numbers("III?", 1, 1, 0, False)
     count = size - writer.size - 40
-    writer.uint32(count, count, count)
+    writer.numbers("III", count, count, count)
     writer.blob(count, lambda place: None)
-    writer.boolean(True)
-    writer.float32(0, 0, 0, 0)
+    writer.numbers("?", True)
+    writer.numbers("ffff", 0, 0, 0, 0)
     return writer.content()
 
 

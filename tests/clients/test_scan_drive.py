@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from shmmap_clients.scan_drive import ScanDrive, open_scans
-from shmmap_clients.scans.scan_file import ScanReader
+from shmmap_clients.scan_drive import ScanDrive
 from shmmap_clients.scans.scan_sequence import Scan
 from shmmap_clients.scans.scan_stream import ScanPublisher
 from shmmap_clients.scans.trajectory import matrix_of, tum_line
@@ -143,29 +142,16 @@ def test_no_scan_is_a_negative_answer(tmp_path: Path, capsys: pytest.CaptureFixt
     assert capsys.readouterr().err == f"program: no scan came from {endpoint}\n"
 
 
-def test_what_cannot_be_done_ends_the_drive(scans: str, tmp_path: Path) -> None:
+def test_what_cannot_be_done_ends_the_drive(scans: str, poses: str, tmp_path: Path) -> None:
     report = Report()
     with ExitStack() as stack, pytest.raises(BadRequest, match="scan s_0 has no pose"):
         ScanDrive(options(scans), "program", None, stack).run(lambda scan: len(scan.pose), report)
     with ExitStack() as stack, pytest.raises(CannotWrite, match="nowhere"):
         ScanDrive(options(scans, json_lines=f"{tmp_path}/nowhere/lines"), "program", None, stack)
+    endpoint = f"ipc://{tmp_path}/publisher"
+    with ExitStack() as stack, pytest.raises(BadRequest, match="those of a publisher bring their poses"):
+        ScanDrive(options(endpoint), "program", poses, stack)
     full = options(scans, json_lines="/dev/full")
     with pytest.raises(CannotWrite, match="/dev/full"), ExitStack() as stack:
         ScanDrive(full, "program", None, stack).run(size, report, document)
     assert report.points == 1
-
-
-def test_scans_as_an_option_names_them(scans: str, poses: str, tmp_path: Path) -> None:
-    endpoint = f"ipc://{tmp_path}/publisher"
-    with ExitStack() as stack:
-        assert [scan.T_map_sensor for scan in open_scans(scans, None, stack, ScanReader())] == [None] * 12
-        posed = list(open_scans(scans, poses, stack, ScanReader()))
-        assert [scan.stamp_s for scan in posed[:2]] == [0.0, 0.5]
-        with pytest.raises(BadRequest, match="publisher"):
-            open_scans(endpoint, poses, stack, ScanReader())
-        publisher = stack.enter_context(ScanPublisher(endpoint))
-        received = open_scans(endpoint, None, stack, ScanReader())
-        assert publisher.wait_for_subscriber(30.0)
-        for scan in (*posed[:2], None):
-            publisher.send(scan)
-        assert [scan.stamp_s for scan in received] == [0.0, 0.5]

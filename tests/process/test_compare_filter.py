@@ -57,6 +57,14 @@ def kept_by_brute_force(scan: Scan, made: DividedMap, distance: float) -> NDArra
     return np.array([((cloud - p) ** 2).sum(axis=1).min() > distance**2 for p in points])
 
 
+def assert_kept(kept: NDArray[np.bool_], scan: Scan, made: DividedMap) -> None:
+    """Compare points within reach of a window of 45 m with brute force."""
+    near = np.hypot(*scan.xyz[:, :2].T) < 40.0
+    expected = kept_by_brute_force(scan, made, 0.5)
+    assert np.array_equal(kept[near], expected[near])
+    assert 0.1 < expected.mean() < 0.9
+
+
 def run(*words: str) -> subprocess.CompletedProcess[str]:
     return run_verb(words, module=PROGRAM[-1])
 
@@ -73,10 +81,7 @@ def test_a_window_gives_what_brute_force_gives(daemon: Factory, divided_map: Div
             x, y = (float(v) for v in scan.T_map_sensor[:2, 3])
             window.move_to(x, y, wait=LONG_S)
             got = compare.follow(window).apply(scan.xyz, scan.T_map_sensor)
-            near = np.hypot(*scan.xyz[:, :2].T) < 40.0
-            expected = kept_by_brute_force(scan, divided_map, 0.5)
-            assert np.array_equal(got.kept[near], expected[near])
-            assert 0.1 < expected.mean() < 0.9
+            assert_kept(got.kept, scan, divided_map)
             tables.append(compare.follow(window)._table)
         assert tables[0] is not tables[-1]
         assert compare.follow(window)._table is tables[-1]  # an unchanged window costs nothing
@@ -91,9 +96,7 @@ def test_a_window_gives_what_brute_force_gives(daemon: Factory, divided_map: Div
         # the window asks again when it moves
         assert window.move_to(0.5, 0.5, wait=LONG_S).changed
         got = compare.follow(window).apply(scan.xyz, scan.T_map_sensor)
-        near = np.hypot(*scan.xyz[:, :2].T) < 40.0
-        expected = kept_by_brute_force(scan, divided_map, 0.5)
-        assert np.array_equal(got.kept[near], expected[near])
+        assert_kept(got.kept, scan, divided_map)
         compare.use_cells(())
 
 
@@ -114,10 +117,8 @@ def test_a_scan_is_compared_with_one_state_of_the_window(daemon: Factory, divide
         comparer = ScanComparer(window, CompareMapFilter(rule), first_wait_s=LONG_S, wait_s=LONG_S)
         for scan in scans:
             compared = comparer(scan)
-            near = np.hypot(*scan.xyz[:, :2].T) < 40.0
-            expected = kept_by_brute_force(scan, divided_map, 0.5)
             assert compared.missing == ""
-            assert np.array_equal(compared.comparison.kept[near], expected[near])
+            assert_kept(compared.comparison.kept, scan, divided_map)
 
 
 def test_of_several_layers_the_rule_s_own_counts(daemon: Factory, divided_map: DividedMap) -> None:

@@ -126,13 +126,7 @@ class CompareMapFilter:
 
     def use_tables(self, tables: Iterable[LayerTable]) -> CompareMapFilter:
         """Compare with tables of `shmmap.layers.build_layer`, without a daemon; errors as in `use_cells`."""
-        self._use(
-            {
-                id(table): SearchCell.of_table(table.columns, table.lattice, table)
-                for table in tables
-                if table.lattice is not None
-            }
-        )
+        self._use({id(one): SearchCell.of_layer(one) for one in tables if one.lattice is not None})
         return self
 
     def _use(self, cells: dict[int, SearchCell]) -> None:
@@ -213,7 +207,6 @@ class CompareMapFilter:
 
 
 def _wrapped(cell: Cell) -> SearchCell:
-    lattice = cell.header.lattice
-    if lattice is None:
+    if cell.lattice is None:
         raise BadRequest(f"{cell.id}: layer {cell.layer} has no lattice: it is no search layer")
-    return SearchCell.of_table(cell.columns, lattice, cell)
+    return SearchCell.of_layer(cell)

@@ -3,14 +3,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap import BadRequest
+from shmmap import BadRequest, Cell
+from shmmap.layers import LayerTable
 
 __all__ = [
     "ADDRESS_START",
@@ -31,15 +32,6 @@ _MAX_BINS: Final = 1 << 16
 _REACH_COLUMNS: Final = 2  # columns of neighbours within one leaf, and a margin for rounding
 # indices of values in a row of the table
 ADDRESS_XYZ, ADDRESS_TILE, ADDRESS_START, TILES_X, TILES_Y, FIRST_X, FIRST_Y, IS_DOUBLE = range(8)
-
-
-class _Lattice(Protocol):
-    @property
-    def first(self) -> tuple[int, int, int]: ...
-    @property
-    def shape(self) -> tuple[int, int, int]: ...
-    @property
-    def leaf(self) -> tuple[float, float, float]: ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,21 +62,23 @@ class SearchCell:
     owner: object = None
 
     @classmethod
-    def of_table(cls, columns: Mapping[str, NDArray[Any]], lattice: _Lattice, owner: object) -> SearchCell:
-        """Wrap the columns of a layer.
+    def of_layer(cls, layer: Cell | LayerTable) -> SearchCell:
+        """Wrap the columns of a layer that has a lattice.
 
         Raises
         ------
         BadRequest
             The columns are not those of a ``search`` layer.
         """
+        columns, lattice = layer.columns, layer.lattice
+        assert lattice is not None  # noqa: S101  # the callers have looked
         missing = [name for name in ("xyz", "tile", "start") if name not in columns]
         if missing:
             raise BadRequest(f"not a search layer: it has no column {', '.join(missing)}")
         xyz, tile, start = columns["xyz"], columns["tile"], columns["start"]
         if xyz.dtype not in (np.dtype("<f4"), np.dtype("<f8")) or not xyz.flags.c_contiguous:
             raise BadRequest(f"xyz of a search layer must be float32 or float64, not {xyz.dtype}")
-        return cls(xyz, tile, start, float(lattice.leaf[0]), (lattice.first[0], lattice.first[1]), owner)
+        return cls(xyz, tile, start, float(lattice.leaf[0]), (lattice.first[0], lattice.first[1]), layer)
 
     @property
     def columns_end(self) -> tuple[int, int]:

@@ -11,7 +11,7 @@ import struct
 from collections.abc import Callable, Iterable
 from typing import Final
 
-__all__ = ["MAX_BYTES", "CdrWriter", "Content"]
+__all__ = ["MAX_BYTES", "CdrWriter", "Content", "copy_into"]
 
 MAX_BYTES: Final = 2**31 - 1
 """Largest sample that CycloneDDS sends (``Internal/MaxSampleSize``), 2 GiB; its lengths have 32 bits."""
@@ -27,6 +27,11 @@ class Content(bytearray):
     def ljust(self, width: int, fill: bytes = b"\0") -> Content:  # type: ignore[override]
         """Return this object, if it is long enough."""
         return self if len(self) >= width else Content(super().ljust(width, fill))
+
+
+def copy_into(place: memoryview, data: bytearray | memoryview) -> None:
+    """Copy bytes to their place in a sample, as the ``fill`` of a `CdrWriter.blob`."""
+    place[:] = data
 
 
 class CdrWriter:
@@ -47,53 +52,31 @@ class CdrWriter:
         """Number of bytes so far, without the encapsulation."""
         return self._start + len(self._now)
 
-    def _pack(self, form: str, align: int, *values: float) -> None:
-        self._now += b"\0" * (-self.size % align)
-        self._now += struct.pack(form, *values)
+    def numbers(self, form: str, *values: float) -> None:
+        """Append numbers; none may be larger than the one before, so that only the first needs alignment.
 
-    def boolean(self, value: bool) -> None:
-        """Append a bool, one byte."""
-        self._pack("<B", 1, value)
-
-    def uint8(self, value: int) -> None:
-        """Append a byte."""
-        self._pack("<B", 1, value)
-
-    def int32(self, *values: int) -> None:
-        """Append signed numbers."""
-        self._pack(f"<{len(values)}i", 4, *values)
-
-    def uint32(self, *values: int) -> None:
-        """Append numbers that are not negative."""
-        self._pack(f"<{len(values)}I", 4, *values)
-
-    def uint64(self, *values: int) -> None:
-        """Append numbers that are not negative."""
-        self._pack(f"<{len(values)}Q", 8, *values)
-
-    def int64(self, value: int) -> None:
-        """Append a signed number."""
-        self._pack("<q", 8, value)
-
-    def float32(self, *values: float) -> None:
-        """Append numbers."""
-        self._pack(f"<{len(values)}f", 4, *values)
-
-    def float64(self, value: float) -> None:
-        """Append a number."""
-        self._pack("<d", 8, value)
+        Parameters
+        ----------
+        form
+            A code of `struct` for each number: ``B`` and ``?`` have one byte, ``i``, ``I`` and ``f`` four,
+            ``q``, ``Q`` and ``d`` eight.
+        values
+            The numbers.
+        """
+        self._now += b"\0" * (-self.size % struct.calcsize(f"<{form[0]}"))
+        self._now += struct.pack(f"<{form}", *values)
 
     def text(self, value: str) -> None:
         """Append a text."""
         data = value.encode()
-        self.uint32(len(data) + 1)
+        self.numbers("I", len(data) + 1)
         self._now += data
         self._now.append(0)
 
     def texts(self, values: Iterable[str]) -> None:
         """Append a sequence of texts."""
         listed = list(values)
-        self.uint32(len(listed))
+        self.numbers("I", len(listed))
         for one in listed:
             self.text(one)
 

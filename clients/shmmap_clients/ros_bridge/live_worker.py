@@ -10,6 +10,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -18,9 +19,9 @@ from numpy.typing import NDArray
 
 from shmmap.live import LiveMap
 from shmmap_clients.rolling_map.live_map import all_voxels
-from shmmap_clients.ros_bridge.cdr import CdrWriter, Content
+from shmmap_clients.ros_bridge.cdr import CdrWriter, Content, copy_into
 from shmmap_clients.ros_bridge.messages import FREE, OCCUPIED, PointCloud2, ServiceKind, ready_made
-from shmmap_clients.ros_bridge.point_cloud import cloud_layout, write_cloud
+from shmmap_clients.ros_bridge.point_cloud import write_cloud
 from shmmap_clients.ros_bridge.service_server import Listening, Request
 from shmmap_clients.ros_bridge.worker import Answer, Worker, no_followup
 
@@ -53,50 +54,33 @@ def _voxel_reply(live: LiveMap, message: Any, kind: str, scope: str) -> Content:
     indices = np.floor(xyz / live.resolution).astype(np.int32)
     writer = _head(live, message, indices)
     count = len(indices)
-    writer.uint64(count, sum(row.active for row in rows))
+    active = sum(row.active for row in rows)
+    ratio = occupied / (occupied + free) if occupied + free else 0.0
     taken = status.file_bytes if scope == "disk" else status.bytes
-    writer.float32(occupied / (occupied + free) if occupied + free else 0.0, taken / 2**20)
-    writer.boolean(True)
+    writer.numbers("QQff?", count, active, ratio, taken / 2**20, True)
     return writer.content()
 
 
 def _failed_reply(message: Any) -> Content:
     """Return a reply without voxels that reports failure."""
     writer = _head(None, message, np.empty((0, 3), np.int32))
-    writer.uint64(0, 0)
-    writer.float32(0.0, 0.0)
-    writer.boolean(False)
+    writer.numbers("QQff?", 0, 0, 0.0, 0.0, False)
     return writer.content()
 
 
 def _head(live: LiveMap | None, message: Any, indices: NDArray[np.int32]) -> CdrWriter:
     """Write a reply up to the end of its ``bonxai_msgs/VoxelGrid``."""
     writer = CdrWriter()
-    writer.uint64(message.client)
-    writer.int64(message.number)
     now_ns = time.time_ns() if live is not None else 0
-    writer.int32(now_ns // 10**9)
-    writer.uint32(now_ns % 10**9)
+    writer.numbers("QqiI", message.client, message.number, now_ns // 10**9, now_ns % 10**9)
     writer.text(live.frame_id if live is not None else "")
-    writer.float64(live.resolution if live is not None else 0.0)
-    for axis in range(3):
-        writer.uint32(len(indices))
-        if len(indices):
-            writer.blob(4 * len(indices), _Axis(indices, axis))
-    writer.uint32(len(indices))
-    for ends in (indices.min(axis=0), indices.max(axis=0)) if len(indices) else ((0, 0, 0), (0, 0, 0)):
-        writer.int32(*(int(one) for one in ends))
+    writer.numbers("d", live.resolution if live is not None else 0.0)
+    for values in np.ascontiguousarray(indices.T):
+        writer.numbers("I", len(values))
+        writer.blob(values.nbytes, partial(copy_into, data=values.view(np.uint8).data))
+    low, high = (indices.min(axis=0), indices.max(axis=0)) if len(indices) else ((0, 0, 0), (0, 0, 0))
+    writer.numbers("Iiiiiii", len(indices), *low, *high)
     return writer
-
-
-class _Axis:
-    """Writer of one column of the indices."""
-
-    def __init__(self, indices: NDArray[np.int32], axis: int) -> None:
-        self._values = indices[:, axis]
-
-    def __call__(self, place: memoryview) -> None:
-        np.frombuffer(place, "<i4")[...] = self._values
 
 
 def _voxel_cloud(live: LiveMap, kind: str) -> Content:
@@ -107,9 +91,8 @@ def _voxel_cloud(live: LiveMap, kind: str) -> Content:
     ShmmapError
         The daemon does not answer, or has no memory for a list.
     """
-    xyz = all_voxels(live, kind)
-    columns, writer = {"xyz": xyz}, CdrWriter()
-    write_cloud(writer, columns, (0.0, 0.0, 0.0), cloud_layout(columns), live.frame_id, time.time_ns())
+    writer = CdrWriter()
+    write_cloud(writer, {"xyz": all_voxels(live, kind)}, (0.0, 0.0, 0.0), live.frame_id, time.time_ns())
     return writer.content()
 
 

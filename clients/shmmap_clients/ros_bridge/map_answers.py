@@ -23,7 +23,7 @@ from __future__ import annotations
 import math
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -31,8 +31,8 @@ from numpy.typing import NDArray
 
 from shmmap import AutowareSquare, Cell, CellInfo, CellSet, Client
 from shmmap_clients.ros_bridge.cdr import MAX_BYTES, CdrWriter, Content
-from shmmap_clients.ros_bridge.messages import GetDifferentialRequest, GetPartialRequest
-from shmmap_clients.ros_bridge.point_cloud import CloudLayout, cloud_layout, write_cloud
+from shmmap_clients.ros_bridge.messages import DIFFERENTIAL, PARTIAL
+from shmmap_clients.ros_bridge.point_cloud import write_cloud
 from shmmap_clients.ros_bridge.worker import StillLoading, TooLarge, no_followup
 
 __all__ = ["MAX_REQUESTERS", "Catalogue", "MapAnswers", "RecentCells", "Requesters", "sensible", "touches"]
@@ -85,13 +85,12 @@ class Catalogue:
     def message(self, frame_id: str, stamp_ns: int) -> Content:
         """Return the list of cells as ``autoware_map_msgs/PointCloudMapMetaData``."""
         writer = CdrWriter()
-        writer.int32(stamp_ns // 10**9)
-        writer.uint32(stamp_ns % 10**9)
+        writer.numbers("iI", stamp_ns // 10**9, stamp_ns % 10**9)
         writer.text(frame_id)
-        writer.uint32(len(self.cells))
+        writer.numbers("I", len(self.cells))
         for cell in self.cells.values():
             writer.text(cell.id)
-            writer.float32(*cell.box)
+            writer.numbers("ffff", *cell.box)
         return writer.content()
 
 
@@ -172,7 +171,6 @@ _MAX_CELLS: Final = 100_000
 """Largest number of cells in one answer, repetitions included."""
 _NAMED: Final = 3
 _REUSED_BYTES: Final = 16 << 20
-_LAYOUTS: Final = 64
 Log = Callable[[str], None]
 
 
@@ -270,13 +268,10 @@ class MapAnswers:
         self._wait_s = wait_s
         self._log = log
         self._recent = RecentCells()
-        self._layouts: dict[Hashable, CloudLayout] = {}
         self._until_s = 0.0
         self._sent: Content | None = None  # the last reply, whose memory is reused
 
-    def answer(
-        self, message: Any, requester: str, begun_s: float | None = None
-    ) -> tuple[Content, Callable[[], None]]:
+    def answer(self, message: Any, requester: str, begun_s: float) -> tuple[Content, Callable[[], None]]:
         """Return a reply, and a function to call once it has been sent.
 
         Send it before the next call.  ``begun_s`` is the time of the first attempt at this request.
@@ -290,10 +285,10 @@ class MapAnswers:
         ShmmapError
             The daemon does not answer, or refuses; the state is then unchanged.
         """
-        self._until_s = (time.monotonic() if begun_s is None else begun_s) + self._wait_s
-        if isinstance(message, GetDifferentialRequest):
+        self._until_s = begun_s + self._wait_s
+        if isinstance(message, DIFFERENTIAL.request):
             return self._differential(message, requester)
-        if isinstance(message, GetPartialRequest):
+        if isinstance(message, PARTIAL.request):
             area = sensible(message.area)
             if area is not None and self._is_small(message.area):
                 cells: Sequence[Cell] = self._all(
@@ -309,9 +304,7 @@ class MapAnswers:
         """Return the empty reply, for a request that the daemon refuses."""
         return self._reply(message, ())
 
-    def _differential(
-        self, message: GetDifferentialRequest, requester: str
-    ) -> tuple[Content, Callable[[], None]]:
+    def _differential(self, message: Any, requester: str) -> tuple[Content, Callable[[], None]]:
         held = self._requesters.held(requester, message.cached_ids, self._catalogue.versions)
         area = sensible(message.area)
         if area is not None and _is_one_slice(message.cached_ids) and self._is_small(message.area):
@@ -381,13 +374,10 @@ class MapAnswers:
 
     def _reply(self, message: Any, cells: Iterable[Cell], removed: Collection[str] | None = None) -> Content:
         writer = CdrWriter()
-        writer.uint64(message.client)
-        writer.int64(message.number)
-        writer.int32(0)
-        writer.uint32(0)
+        writer.numbers("QqiI", message.client, message.number, 0, 0)
         writer.text(self._client.welcome.frame_id)
         self._write_cells(writer, self._recent.kept(cells))
-        if isinstance(message, GetDifferentialRequest):
+        if isinstance(message, DIFFERENTIAL.request):
             writer.texts(removed or ())
         try:
             content = writer.content(self._sent)
@@ -398,18 +388,11 @@ class MapAnswers:
 
     def _write_cells(self, writer: CdrWriter, cells: Sequence[Cell]) -> None:
         """Append cells with their points, a sequence of ``autoware_map_msgs/PointCloudMapCellWithID``."""
-        writer.uint32(len(cells))
+        writer.numbers("I", len(cells))
         for cell in cells:
-            columns = cell.columns
-            kind = tuple((name, one.dtype, one.shape[1:]) for name, one in columns.items())
-            layout = self._layouts.get(kind)
-            if layout is None:
-                if len(self._layouts) >= _LAYOUTS:
-                    self._layouts.clear()
-                layout = self._layouts[kind] = cloud_layout(columns)
             writer.text(cell.id)
-            write_cloud(writer, columns, cell.origin, layout)
-            writer.float32(*cell.box)
+            write_cloud(writer, cell.columns, cell.origin)
+            writer.numbers("ffff", *cell.box)
             if writer.size > MAX_BYTES:  # stop early: thousands of repetitions take long
                 raise TooLarge(
                     f"an answer of more than {MAX_BYTES} bytes", hint="ask for fewer cells at once"

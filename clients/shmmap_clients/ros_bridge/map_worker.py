@@ -6,12 +6,13 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Collection
+from functools import partial
 from typing import Any, Final
 
 from cyclonedds.pub import DataWriter
 
 from shmmap import BadRequest, CellInfo, Client, LoadFailed
-from shmmap_clients.ros_bridge.cdr import MAX_BYTES, CdrWriter, Content
+from shmmap_clients.ros_bridge.cdr import MAX_BYTES, CdrWriter, Content, copy_into
 from shmmap_clients.ros_bridge.map_answers import Catalogue, MapAnswers, Requesters
 from shmmap_clients.ros_bridge.messages import MapMetaData, PointCloud2, ready_made
 from shmmap_clients.ros_bridge.point_cloud import CloudLayout, cloud_layout, fill_rows, write_cloud_head
@@ -84,15 +85,11 @@ def _whole_map(
     layout = layout or cloud_layout({})
     writer = CdrWriter()
     write_cloud_head(writer, layout, points, client.welcome.frame_id, stamp_ns)
-    writer.uint32(len(data))
+    writer.numbers("I", len(data))
     if data:
-        writer.blob(len(data), lambda to: _copy(to, data))
-    writer.boolean(True)
+        writer.blob(len(data), partial(copy_into, data=data))
+    writer.numbers("?", True)
     return writer.content()
-
-
-def _copy(place: memoryview, data: bytearray) -> None:
-    place[:] = data
 
 
 class MapWorker(Worker):
@@ -162,7 +159,7 @@ class MapWorker(Worker):
         if self._client.disconnected_since is not None:
             # requests for cells wait longer before they find that the daemon is away
             self._catalogue.refresh(self._client)
-        return self._answers.answer(message, request.requester.name, request.tries.begun_s)
+        return self._answers.answer(message, request.requester.name, request.begun_s)
 
     def empty(self, message: Any) -> Content:
         """Return a reply without cells."""

@@ -16,7 +16,7 @@ import struct
 from dataclasses import dataclass
 from typing import Any, Final, TypeVar
 
-from cyclonedds.idl import IdlStruct
+from cyclonedds.idl import IdlStruct, make_idl_struct
 from cyclonedds.idl.annotations import final
 from cyclonedds.idl.types import float32, float64, int32, int64, sequence, uint8, uint32, uint64
 
@@ -31,16 +31,6 @@ __all__ = [
     "CellMetaDataWithID",
     "CellWithID",
     "Damaged",
-    "GetDifferentialRequest",
-    "GetDifferentialResponse",
-    "GetFreeRequest",
-    "GetFreeResponse",
-    "GetOccupiedRequest",
-    "GetOccupiedResponse",
-    "GetPartialRequest",
-    "GetPartialResponse",
-    "GetSelectedRequest",
-    "GetSelectedResponse",
     "Header",
     "MapMetaData",
     "PointCloud2",
@@ -50,6 +40,7 @@ __all__ = [
     "VoxelGrid",
     "ready_made",
     "sample",
+    "service",
 ]
 
 _Sample = TypeVar("_Sample")
@@ -69,14 +60,14 @@ class Damaged:
 
 
 def sample(kind: type[_Sample]) -> type[_Sample]:
-    """Class decorator: send prepared bytes as a message, and tolerate invalid bytes on reception.
+    """Class decorator: a dataclass that may be sent as prepared bytes, and tolerates invalid ones received.
 
     The layout is that of all ROS types: fields one after another, without extensions (``final``).
     """
     kind.serialize = _serialize  # type: ignore[attr-defined]
     kind.deserialize = classmethod(_deserialize)  # type: ignore[attr-defined]
     kind.ready = None  # type: ignore[attr-defined]  # no annotation, so that it is no field of the message
-    return final(kind)  # type: ignore[no-any-return]
+    return dataclass(final(kind))  # type: ignore[no-any-return]
 
 
 def _serialize(
@@ -111,22 +102,32 @@ def ready_made(kind: type[_Sample], content: bytearray) -> _Sample:
 
 @dataclass(frozen=True, slots=True)
 class ServiceKind:
-    """Types of a service.
+    """Types of a service: the classes of its messages."""
 
-    Attributes
-    ----------
-    name
-        Name in ROS notation, ``autoware_map_msgs/srv/GetPartialPointCloudMap``.
-    request, reply
-        Classes of the messages.
-    """
-
-    name: str
     request: type[Any]
     reply: type[Any]
 
 
-@dataclass
+def service(name: str, request: dict[str, Any], reply: dict[str, Any]) -> ServiceKind:
+    """Return the types of a service; both messages begin with ``client`` and ``number``.
+
+    Parameters
+    ----------
+    name
+        Name in ROS notation, ``autoware_map_msgs/srv/GetPartialPointCloudMap``.
+    request, reply
+        Types of the messages' further fields, by name.
+    """
+    package, _, kind = name.split("/")
+    head = {"client": uint64, "number": int64}
+
+    def message(part: str, fields: dict[str, Any]) -> type[Any]:
+        typename = f"{package}::srv::dds_::{kind}_{part}_"
+        return sample(make_idl_struct(f"{kind}_{part}", typename, head | fields, dataclassify=False))
+
+    return ServiceKind(message("Request", request), message("Response", reply))
+
+
 @sample
 class Time(IdlStruct, typename="builtin_interfaces::msg::dds_::Time_"):
     """A point in time: seconds and nanoseconds since 1970."""
@@ -135,7 +136,6 @@ class Time(IdlStruct, typename="builtin_interfaces::msg::dds_::Time_"):
     nanosec: uint32
 
 
-@dataclass
 @sample
 class Header(IdlStruct, typename="std_msgs::msg::dds_::Header_"):
     """Time and frame of a message."""
@@ -144,7 +144,6 @@ class Header(IdlStruct, typename="std_msgs::msg::dds_::Header_"):
     frame_id: str
 
 
-@dataclass
 @sample
 class PointField(IdlStruct, typename="sensor_msgs::msg::dds_::PointField_"):
     """One field of each point: offset in bytes, type (1 int8 to 8 float64), number of values."""
@@ -155,7 +154,6 @@ class PointField(IdlStruct, typename="sensor_msgs::msg::dds_::PointField_"):
     count: uint32
 
 
-@dataclass
 @sample
 class PointCloud2(IdlStruct, typename="sensor_msgs::msg::dds_::PointCloud2_"):
     """Points as bytes: ``width`` x ``height`` of ``point_step`` bytes each."""
@@ -171,7 +169,6 @@ class PointCloud2(IdlStruct, typename="sensor_msgs::msg::dds_::PointCloud2_"):
     is_dense: bool
 
 
-@dataclass
 @sample
 class AreaInfo(IdlStruct, typename="autoware_map_msgs::msg::dds_::AreaInfo_"):
     """An area around a position, metres, map frame."""
@@ -181,7 +178,6 @@ class AreaInfo(IdlStruct, typename="autoware_map_msgs::msg::dds_::AreaInfo_"):
     radius: float32
 
 
-@dataclass
 @sample
 class CellMetaData(IdlStruct, typename="autoware_map_msgs::msg::dds_::PointCloudMapCellMetaData_"):
     """A cell's box, metres in the map frame."""
@@ -192,7 +188,6 @@ class CellMetaData(IdlStruct, typename="autoware_map_msgs::msg::dds_::PointCloud
     max_y: float32
 
 
-@dataclass
 @sample
 class CellMetaDataWithID(
     IdlStruct, typename="autoware_map_msgs::msg::dds_::PointCloudMapCellMetaDataWithID_"
@@ -203,7 +198,6 @@ class CellMetaDataWithID(
     metadata: CellMetaData
 
 
-@dataclass
 @sample
 class CellWithID(IdlStruct, typename="autoware_map_msgs::msg::dds_::PointCloudMapCellWithID_"):
     """A cell with its points."""
@@ -213,7 +207,6 @@ class CellWithID(IdlStruct, typename="autoware_map_msgs::msg::dds_::PointCloudMa
     metadata: CellMetaData
 
 
-@dataclass
 @sample
 class MapMetaData(IdlStruct, typename="autoware_map_msgs::msg::dds_::PointCloudMapMetaData_"):
     """All cells of the map, without their points."""
@@ -222,95 +215,26 @@ class MapMetaData(IdlStruct, typename="autoware_map_msgs::msg::dds_::PointCloudM
     metadata_list: sequence[CellMetaDataWithID]
 
 
-@dataclass
-@sample
-class GetPartialRequest(IdlStruct, typename="autoware_map_msgs::srv::dds_::GetPartialPointCloudMap_Request_"):
-    """A request for the cells that touch an area."""
+_CELLS: Final = {"header": Header, "new_pointcloud_with_ids": sequence[CellWithID]}
 
-    client: uint64
-    number: int64
-    area: AreaInfo
-
-
-@dataclass
-@sample
-class GetPartialResponse(
-    IdlStruct, typename="autoware_map_msgs::srv::dds_::GetPartialPointCloudMap_Response_"
-):
-    """The cells that touch the area, in the order of their ids."""
-
-    client: uint64
-    number: int64
-    header: Header
-    new_pointcloud_with_ids: sequence[CellWithID]
-
-
-@dataclass
-@sample
-class GetDifferentialRequest(
-    IdlStruct, typename="autoware_map_msgs::srv::dds_::GetDifferentialPointCloudMap_Request_"
-):
-    """A request for the cells that touch an area, without those that the client has."""
-
-    client: uint64
-    number: int64
-    area: AreaInfo
-    cached_ids: sequence[str]
-
-
-@dataclass
-@sample
-class GetDifferentialResponse(
-    IdlStruct, typename="autoware_map_msgs::srv::dds_::GetDifferentialPointCloudMap_Response_"
-):
-    """The cells that are new to the client, and the ids that it may drop."""
-
-    client: uint64
-    number: int64
-    header: Header
-    new_pointcloud_with_ids: sequence[CellWithID]
-    ids_to_remove: sequence[str]
-
-
-@dataclass
-@sample
-class GetSelectedRequest(
-    IdlStruct, typename="autoware_map_msgs::srv::dds_::GetSelectedPointCloudMap_Request_"
-):
-    """A request for the cells with these ids."""
-
-    client: uint64
-    number: int64
-    cell_ids: sequence[str]
-
-
-@dataclass
-@sample
-class GetSelectedResponse(
-    IdlStruct, typename="autoware_map_msgs::srv::dds_::GetSelectedPointCloudMap_Response_"
-):
-    """The cells, in the order of the request."""
-
-    client: uint64
-    number: int64
-    header: Header
-    new_pointcloud_with_ids: sequence[CellWithID]
-
-
-PARTIAL: Final = ServiceKind(
-    "autoware_map_msgs/srv/GetPartialPointCloudMap", GetPartialRequest, GetPartialResponse
+PARTIAL: Final = service(
+    "autoware_map_msgs/srv/GetPartialPointCloudMap", request={"area": AreaInfo}, reply=_CELLS
 )
+"""Cells that touch an area, in the order of their ids."""
 
-DIFFERENTIAL: Final = ServiceKind(
-    "autoware_map_msgs/srv/GetDifferentialPointCloudMap", GetDifferentialRequest, GetDifferentialResponse
+DIFFERENTIAL: Final = service(
+    "autoware_map_msgs/srv/GetDifferentialPointCloudMap",
+    request={"area": AreaInfo, "cached_ids": sequence[str]},
+    reply={**_CELLS, "ids_to_remove": sequence[str]},
 )
+"""Cells that touch an area and are new to the client, and the ids that it may drop."""
 
-SELECTED: Final = ServiceKind(
-    "autoware_map_msgs/srv/GetSelectedPointCloudMap", GetSelectedRequest, GetSelectedResponse
+SELECTED: Final = service(
+    "autoware_map_msgs/srv/GetSelectedPointCloudMap", request={"cell_ids": sequence[str]}, reply=_CELLS
 )
+"""Cells with these ids, in the order of the request."""
 
 
-@dataclass
 @sample
 class VoxelGrid(IdlStruct, typename="bonxai_msgs::msg::dds_::VoxelGrid_"):
     """Voxels by their indices, ``floor(position / resolution)`` along each axis, and the box around them."""
@@ -329,56 +253,31 @@ class VoxelGrid(IdlStruct, typename="bonxai_msgs::msg::dds_::VoxelGrid_"):
     max_z: int32
 
 
-@dataclass
-@sample
-class GetOccupiedRequest(IdlStruct, typename="bonxai_msgs::srv::dds_::GetOccupiedVoxels_Request_"):
-    """A request for all occupied voxels; a ROS message without fields has one byte."""
+def _voxel_service(name: str, count: str) -> ServiceKind:
+    """Return the types of a service of all voxels of a kind.
 
-    client: uint64
-    number: int64
-    structure_needs_at_least_one_member: uint8
+    ``occupancy_ratio`` of the reply is occupied / (occupied + free).
 
-
-@dataclass
-@sample
-class GetOccupiedResponse(IdlStruct, typename="bonxai_msgs::srv::dds_::GetOccupiedVoxels_Response_"):
-    """The voxels and the map's counts; ``occupancy_ratio`` is occupied / (occupied + free)."""
-
-    client: uint64
-    number: int64
-    voxel_grid: VoxelGrid
-    occupied_count: uint64
-    total_active_cells: uint64
-    occupancy_ratio: float32
-    memory_mb: float32
-    success: bool
-
-
-@dataclass
-@sample
-class GetFreeRequest(IdlStruct, typename="bonxai_msgs::srv::dds_::GetFreeVoxels_Request_"):
-    """A request for all free voxels."""
-
-    client: uint64
-    number: int64
-    structure_needs_at_least_one_member: uint8
+    Parameters
+    ----------
+    name
+        Name in ROS notation.
+    count
+        Name of the reply's count of these voxels.
+    """
+    return service(
+        name,
+        request={"structure_needs_at_least_one_member": uint8},  # a ROS message without fields has one byte
+        reply={
+            "voxel_grid": VoxelGrid,
+            count: uint64,
+            "total_active_cells": uint64,
+            "occupancy_ratio": float32,
+            "memory_mb": float32,
+            "success": bool,
+        },
+    )
 
 
-@dataclass
-@sample
-class GetFreeResponse(IdlStruct, typename="bonxai_msgs::srv::dds_::GetFreeVoxels_Response_"):
-    """The voxels, as in `GetOccupiedResponse`."""
-
-    client: uint64
-    number: int64
-    voxel_grid: VoxelGrid
-    free_count: uint64
-    total_active_cells: uint64
-    occupancy_ratio: float32
-    memory_mb: float32
-    success: bool
-
-
-OCCUPIED: Final = ServiceKind("bonxai_msgs/srv/GetOccupiedVoxels", GetOccupiedRequest, GetOccupiedResponse)
-
-FREE: Final = ServiceKind("bonxai_msgs/srv/GetFreeVoxels", GetFreeRequest, GetFreeResponse)
+OCCUPIED: Final = _voxel_service("bonxai_msgs/srv/GetOccupiedVoxels", "occupied_count")
+FREE: Final = _voxel_service("bonxai_msgs/srv/GetFreeVoxels", "free_count")

@@ -161,7 +161,18 @@ class RosBridge:
                 self._add(services[what], kind, self._map.listening)
             if live is not None:
                 self._add_live(live, services["live"])
-            self._parameters = self._make_parameters(welcome.map_path)
+            self._parameters = Parameters(
+                {
+                    "enable_whole_load": settings.whole_map,
+                    "enable_downsampled_whole_load": False,
+                    "enable_partial_load": True,
+                    "enable_selected_load": True,
+                    "pcd_metadata_path": "",
+                    "pcd_paths_or_directory": [welcome.map_path],
+                    "use_sim_time": False,
+                },
+                {"pcd_paths_or_directory": "the map that shmmap serves"},
+            )
             self._listening = Listening(self._participant, log)
             for name, kind in PARAMETER_SERVICES.items():
                 self._add(f"{own}/{name}", kind, self._listening)
@@ -175,11 +186,6 @@ class RosBridge:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-    @property
-    def services(self) -> list[str]:
-        """Names of all services."""
-        return [server.name for server in self._servers]
 
     def stop(self) -> None:
         """End `run`; may be called from a signal handler."""
@@ -249,20 +255,6 @@ class RosBridge:
         for name, (kind, _, _) in LIVE_SERVICES.items():
             self._add(f"{place}/{name}", kind, worker.listening)
 
-    def _make_parameters(self, map_path: str) -> Parameters:
-        return Parameters(
-            {
-                "enable_whole_load": self._settings.whole_map,
-                "enable_downsampled_whole_load": False,
-                "enable_partial_load": True,
-                "enable_selected_load": True,
-                "pcd_metadata_path": "",
-                "pcd_paths_or_directory": [map_path],
-                "use_sim_time": False,
-            },
-            {"pcd_paths_or_directory": "the map that shmmap serves"},
-        )
-
     # --- requests -----------------------------------------------------------------------------------
 
     def _answer_parameters(self) -> None:
@@ -304,17 +296,17 @@ class _IncompatiblePeers:
     ----------
     log
         Called once with a line about each client.
+
+    Attributes
+    ----------
+    now
+        Present incompatible clients, at most 32: ``service``, and ``vendor`` of their DDS or empty.
     """
 
     def __init__(self, log: Callable[[str], None]) -> None:
         self._log = log
         self._logged: dict[str, None] = {}
-        self._now: list[dict[str, str]] = []
-
-    @property
-    def now(self) -> list[dict[str, str]]:
-        """Present incompatible clients, at most 32: ``service``, and ``vendor`` of their DDS or empty."""
-        return self._now
+        self.now: list[dict[str, str]] = []
 
     def look(self, clients: Iterable[tuple[ServiceServer, Requester]]) -> None:
         """Record the present clients, and log each new incompatible one."""
@@ -330,4 +322,4 @@ class _IncompatiblePeers:
             )
         while len(self._logged) > 8 * _MAX_LISTED:
             del self._logged[next(iter(self._logged))]
-        self._now = [{"service": server.name, "vendor": one.vendor} for server, one in found[:_MAX_LISTED]]
+        self.now = [{"service": server.name, "vendor": one.vendor} for server, one in found[:_MAX_LISTED]]

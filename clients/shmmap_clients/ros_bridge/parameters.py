@@ -6,13 +6,12 @@ reads ``enable_partial_load`` to choose between the service and the topic.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Final
 
 from cyclonedds.idl import IdlStruct
 from cyclonedds.idl.types import float64, int64, sequence, uint8, uint64
 
-from shmmap_clients.ros_bridge.messages import ServiceKind, sample
+from shmmap_clients.ros_bridge.messages import ServiceKind, sample, service
 
 __all__ = [
     "PARAMETER_SERVICES",
@@ -35,7 +34,6 @@ _READ_ONLY: Final = "parameter '{}' cannot be set because it is read-only"
 _SOME_NOT_DECLARED: Final = "One or more parameters were not declared before setting"
 
 
-@dataclass
 @sample
 class ParameterValue(IdlStruct, typename="rcl_interfaces::msg::dds_::ParameterValue_"):
     """A value of one type: 0 not set, 1 bool, 2 integer, 3 double, 4 string, 5 to 9 arrays (5: of bytes)."""
@@ -52,7 +50,6 @@ class ParameterValue(IdlStruct, typename="rcl_interfaces::msg::dds_::ParameterVa
     string_array_value: sequence[str]
 
 
-@dataclass
 @sample
 class Parameter(IdlStruct, typename="rcl_interfaces::msg::dds_::Parameter_"):
     """A parameter."""
@@ -61,7 +58,6 @@ class Parameter(IdlStruct, typename="rcl_interfaces::msg::dds_::Parameter_"):
     value: ParameterValue
 
 
-@dataclass
 @sample
 class FloatingPointRange(IdlStruct, typename="rcl_interfaces::msg::dds_::FloatingPointRange_"):
     """Range of allowed numbers."""
@@ -71,7 +67,6 @@ class FloatingPointRange(IdlStruct, typename="rcl_interfaces::msg::dds_::Floatin
     step: float64
 
 
-@dataclass
 @sample
 class IntegerRange(IdlStruct, typename="rcl_interfaces::msg::dds_::IntegerRange_"):
     """Range of allowed whole numbers."""
@@ -81,7 +76,6 @@ class IntegerRange(IdlStruct, typename="rcl_interfaces::msg::dds_::IntegerRange_
     step: uint64
 
 
-@dataclass
 @sample
 class ParameterDescriptor(IdlStruct, typename="rcl_interfaces::msg::dds_::ParameterDescriptor_"):
     """Description of a parameter."""
@@ -96,7 +90,6 @@ class ParameterDescriptor(IdlStruct, typename="rcl_interfaces::msg::dds_::Parame
     integer_range: sequence[IntegerRange, 1]
 
 
-@dataclass
 @sample
 class SetParametersResult(IdlStruct, typename="rcl_interfaces::msg::dds_::SetParametersResult_"):
     """Whether a parameter was set, and if not, the reason."""
@@ -105,7 +98,6 @@ class SetParametersResult(IdlStruct, typename="rcl_interfaces::msg::dds_::SetPar
     reason: str
 
 
-@dataclass
 @sample
 class ListParametersResult(IdlStruct, typename="rcl_interfaces::msg::dds_::ListParametersResult_"):
     """Names of parameters, and their prefixes."""
@@ -114,156 +106,45 @@ class ListParametersResult(IdlStruct, typename="rcl_interfaces::msg::dds_::ListP
     prefixes: sequence[str]
 
 
-@dataclass
-@sample
-class GetParametersRequest(IdlStruct, typename="rcl_interfaces::srv::dds_::GetParameters_Request_"):
-    """A request for the values of parameters."""
-
-    client: uint64
-    number: int64
-    names: sequence[str]
-
-
-@dataclass
-@sample
-class GetParametersResponse(IdlStruct, typename="rcl_interfaces::srv::dds_::GetParameters_Response_"):
-    """The values, in the order of the request."""
-
-    client: uint64
-    number: int64
-    values: sequence[ParameterValue]
-
-
-@dataclass
-@sample
-class GetParameterTypesRequest(IdlStruct, typename="rcl_interfaces::srv::dds_::GetParameterTypes_Request_"):
-    """A request for the types of parameters."""
-
-    client: uint64
-    number: int64
-    names: sequence[str]
-
-
-@dataclass
-@sample
-class GetParameterTypesResponse(IdlStruct, typename="rcl_interfaces::srv::dds_::GetParameterTypes_Response_"):
-    """The types, in the order of the request."""
-
-    client: uint64
-    number: int64
-    types: sequence[uint8]
-
-
-@dataclass
-@sample
-class SetParametersRequest(IdlStruct, typename="rcl_interfaces::srv::dds_::SetParameters_Request_"):
-    """A request to set parameters one by one."""
-
-    client: uint64
-    number: int64
-    parameters: sequence[Parameter]
-
-
-@dataclass
-@sample
-class SetParametersResponse(IdlStruct, typename="rcl_interfaces::srv::dds_::SetParameters_Response_"):
-    """The result for each parameter."""
-
-    client: uint64
-    number: int64
-    results: sequence[SetParametersResult]
-
-
-@dataclass
-@sample
-class SetParametersAtomicallyRequest(
-    IdlStruct, typename="rcl_interfaces::srv::dds_::SetParametersAtomically_Request_"
-):
-    """A request to set all of these parameters or none."""
-
-    client: uint64
-    number: int64
-    parameters: sequence[Parameter]
-
-
-@dataclass
-@sample
-class SetParametersAtomicallyResponse(
-    IdlStruct, typename="rcl_interfaces::srv::dds_::SetParametersAtomically_Response_"
-):
-    """The result for all parameters together."""
-
-    client: uint64
-    number: int64
-    result: SetParametersResult
-
-
-@dataclass
-@sample
-class ListParametersRequest(IdlStruct, typename="rcl_interfaces::srv::dds_::ListParameters_Request_"):
-    """A request for the names of parameters below prefixes, ``depth`` levels down (0: all)."""
-
-    client: uint64
-    number: int64
-    prefixes: sequence[str]
-    depth: uint64
-
-
-@dataclass
-@sample
-class ListParametersResponse(IdlStruct, typename="rcl_interfaces::srv::dds_::ListParameters_Response_"):
-    """The names and prefixes."""
-
-    client: uint64
-    number: int64
-    result: ListParametersResult
-
-
-@dataclass
-@sample
-class DescribeParametersRequest(IdlStruct, typename="rcl_interfaces::srv::dds_::DescribeParameters_Request_"):
-    """A request for descriptions of parameters."""
-
-    client: uint64
-    number: int64
-    names: sequence[str]
-
-
-@dataclass
-@sample
-class DescribeParametersResponse(
-    IdlStruct, typename="rcl_interfaces::srv::dds_::DescribeParameters_Response_"
-):
-    """The descriptions, in the order of the request."""
-
-    client: uint64
-    number: int64
-    descriptors: sequence[ParameterDescriptor]
-
-
-PARAMETER_SERVICES: Final = {
-    "get_parameters": ServiceKind(
-        "rcl_interfaces/srv/GetParameters", GetParametersRequest, GetParametersResponse
+_NAMES: Final = {"names": sequence[str]}
+_VALUES: Final = {"parameters": sequence[Parameter]}
+PARAMETER_SERVICES: Final[Mapping[str, ServiceKind]] = {
+    "get_parameters": service(
+        "rcl_interfaces/srv/GetParameters",
+        request=_NAMES,
+        reply={"values": sequence[ParameterValue]},
     ),
-    "get_parameter_types": ServiceKind(
-        "rcl_interfaces/srv/GetParameterTypes", GetParameterTypesRequest, GetParameterTypesResponse
+    "get_parameter_types": service(
+        "rcl_interfaces/srv/GetParameterTypes",
+        request=_NAMES,
+        reply={"types": sequence[uint8]},
     ),
-    "set_parameters": ServiceKind(
-        "rcl_interfaces/srv/SetParameters", SetParametersRequest, SetParametersResponse
+    "set_parameters": service(
+        "rcl_interfaces/srv/SetParameters",
+        request=_VALUES,
+        reply={"results": sequence[SetParametersResult]},
     ),
-    "set_parameters_atomically": ServiceKind(
+    "set_parameters_atomically": service(
         "rcl_interfaces/srv/SetParametersAtomically",
-        SetParametersAtomicallyRequest,
-        SetParametersAtomicallyResponse,
+        request=_VALUES,
+        reply={"result": SetParametersResult},
     ),
-    "list_parameters": ServiceKind(
-        "rcl_interfaces/srv/ListParameters", ListParametersRequest, ListParametersResponse
+    "list_parameters": service(
+        "rcl_interfaces/srv/ListParameters",
+        request={"prefixes": sequence[str], "depth": uint64},
+        reply={"result": ListParametersResult},
     ),
-    "describe_parameters": ServiceKind(
-        "rcl_interfaces/srv/DescribeParameters", DescribeParametersRequest, DescribeParametersResponse
+    "describe_parameters": service(
+        "rcl_interfaces/srv/DescribeParameters",
+        request=_NAMES,
+        reply={"descriptors": sequence[ParameterDescriptor]},
     ),
 }
-"""Types of the parameter services, by the last part of their names."""
+"""Types of the parameter services, by the last part of their names.
+
+Lists of a reply are in the order of the request.  ``depth`` is the number of levels of names below the
+prefixes; 0: all.
+"""
 
 
 class Parameters:

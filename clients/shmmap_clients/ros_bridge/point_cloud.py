@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, Final
 
 import numpy as np
@@ -54,11 +54,18 @@ class CloudLayout:
 
 def cloud_layout(columns: Mapping[str, NDArray[Any]]) -> CloudLayout:
     """Return the layout for columns of these names and types, (N,) or (N, k)."""
+    return _layout(
+        tuple((name, one.dtype.str[1:], math.prod(one.shape[1:])) for name, one in columns.items())
+    )
+
+
+@lru_cache(maxsize=64)
+def _layout(kinds: tuple[tuple[str, str, int], ...]) -> CloudLayout:
+    """Return the layout for columns by name, numpy's name of the type, and number of values."""
     fields: list[tuple[str, int, int, int]] = []
     places: list[tuple[str, int, np.dtype[Any], int]] = []
     offset = 0
-    for name, values in columns.items():
-        kind, count = values.dtype.str[1:], math.prod(values.shape[1:])
+    for name, kind, count in kinds:
         if name == "xyz":
             fields += [(axis, offset + 4 * n, _FLOAT32, 1) for n, axis in enumerate("xyz")]
             kind = "f4"
@@ -69,14 +76,13 @@ def cloud_layout(columns: Mapping[str, NDArray[Any]]) -> CloudLayout:
         places.append((name, offset, np.dtype(f"<{kind}"), count))
         offset += int(kind[1:]) * count
     writer = CdrWriter()
-    writer.uint32(len(fields))
+    writer.numbers("I", len(fields))
     for name, start, datatype, count in fields:
         writer.text(name)
-        writer.uint32(start)
-        writer.uint8(datatype)
-        writer.uint32(count)
-    writer.boolean(False)  # is_bigendian
-    writer.uint32(offset)
+        writer.numbers("IB", start, datatype)
+        writer.numbers("I", count)
+    writer.numbers("?", False)  # is_bigendian
+    writer.numbers("I", offset)
     return CloudLayout(tuple(fields), tuple(places), offset, bytes(writer.content()[4:]))
 
 
@@ -84,7 +90,6 @@ def write_cloud(
     writer: CdrWriter,
     columns: Mapping[str, NDArray[Any]],
     origin: tuple[float, float, float],
-    layout: CloudLayout,
     frame_id: str = "",
     stamp_ns: int = 0,
 ) -> None:
@@ -93,33 +98,30 @@ def write_cloud(
     Parameters
     ----------
     columns
-        Columns of the layout, of equal lengths; they are read when the message is assembled.
+        Columns of equal lengths; they are read when the message is assembled.
     origin
         Origin of ``xyz``, metres.
-    layout
-        Layout of a point's bytes.
     frame_id, stamp_ns
         Frame and time of the header, nanoseconds since 1970.
     """
-    points = len(columns["xyz"])
+    layout, points = cloud_layout(columns), len(columns["xyz"])
     nbytes = points * layout.point_step
     write_cloud_head(writer, layout, points, frame_id, stamp_ns)
-    writer.uint32(nbytes)
+    writer.numbers("I", nbytes)
     if nbytes:
         writer.blob(nbytes, partial(fill_rows, columns=columns, origin=origin, layout=layout))
-    writer.boolean(True)  # is_dense: every coordinate is finite
+    writer.numbers("?", True)  # is_dense: every coordinate is finite
 
 
 def write_cloud_head(
     writer: CdrWriter, layout: CloudLayout, points: int, frame_id: str = "", stamp_ns: int = 0
 ) -> None:
     """Append the part before the points: header, size, fields."""
-    writer.int32(stamp_ns // 10**9)
-    writer.uint32(stamp_ns % 10**9)
+    writer.numbers("iI", stamp_ns // 10**9, stamp_ns % 10**9)
     writer.text(frame_id)
-    writer.uint32(1, points)  # height, width
+    writer.numbers("II", 1, points)  # height, width
     writer.prepared(layout.described)
-    writer.uint32(layout.point_step * points)
+    writer.numbers("I", layout.point_step * points)
 
 
 def fill_rows(

@@ -17,7 +17,7 @@ import re
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Final
 
 from cyclonedds.core import (
@@ -40,7 +40,7 @@ from shmmap_clients.ros_bridge.cdr import Content
 from shmmap_clients.ros_bridge.messages import Damaged, ServiceKind, ready_made
 from shmmap_clients.ros_bridge.participant import endpoint_qos, reply_topic, request_topic
 
-__all__ = ["Listening", "Request", "Requester", "ServiceServer", "Tries"]
+__all__ = ["Listening", "Request", "Requester", "ServiceServer"]
 
 _KNOWN_AT_FIRST_S: Final = 1.0
 _KNOWN_WITHIN_S: Final = 0.1
@@ -73,15 +73,21 @@ class Requester:
     name: str
     incompatible: bool
     vendor: str
-    found_s: float = field(default=0.0, compare=False)
+    found_s: float = 0.0
 
 
-@dataclass(slots=True)
-class Tries:
-    """Attempts to answer a request.
+@dataclass(slots=True, eq=False)
+class Request:
+    """A received request, and the attempts to answer it.
 
     Attributes
     ----------
+    server
+        Server of the service.
+    message
+        The message; its ``client`` and ``number`` are copied to the reply.
+    requester, handle
+        The client, and the DDS handle of its writer.
     begun_s
         Time of the first attempt with a reachable daemon, on `time.monotonic`; 0: none yet.
     was_requeued
@@ -92,33 +98,14 @@ class Tries:
         Number of the daemon's answers at the last failure.
     """
 
-    begun_s: float = 0.0
-    was_requeued: bool = False
-    failed: int = 0
-    answers: int = -1
-
-
-@dataclass(frozen=True, slots=True)
-class Request:
-    """A received request.
-
-    Attributes
-    ----------
-    server
-        Server of the service.
-    message
-        The message; its ``client`` and ``number`` are copied to the reply.
-    requester, handle
-        The client, and the DDS handle of its writer.
-    tries
-        Attempts so far.
-    """
-
     server: ServiceServer
     message: Any
     requester: Requester
     handle: int
-    tries: Tries = field(default_factory=Tries, compare=False)
+    begun_s: float = 0.0
+    was_requeued: bool = False
+    failed: int = 0
+    answers: int = -1
 
 
 class ServiceServer:

@@ -19,7 +19,7 @@ from typing import Any, Final
 from shmmap import BadRequest, DaemonUnreachable, ShmmapError, StaleHandle
 from shmmap.errors import Busy, LiveInterrupted, NoSession
 from shmmap_clients.ros_bridge.cdr import Content
-from shmmap_clients.ros_bridge.service_server import Listening, Request, Tries
+from shmmap_clients.ros_bridge.service_server import Listening, Request
 
 __all__ = [
     "MAX_PER_CLIENT",
@@ -155,10 +155,10 @@ class Worker(ABC):
                 self._serve(self._waiting.get())
 
     def _serve(self, request: Request) -> None:
-        server, tries = request.server, request.tries
-        if tries.was_requeued and server.gone(request):
+        server = request.server
+        if request.was_requeued and server.gone(request):
             return
-        tries.begun_s = tries.begun_s or time.monotonic()
+        request.begun_s = request.begun_s or time.monotonic()
         try:
             content, done = self.answer(request.message, request)
             self._back()
@@ -168,10 +168,10 @@ class Worker(ABC):
             return
         except LATER as error:
             self._gone(error)
-            if self._has_failed(tries):
-                self._log(f"{server.name}: not answered after {tries.failed} tries: {error}")
+            if self._has_failed(request):
+                self._log(f"{server.name}: not answered after {request.failed} tries: {error}")
                 return
-            tries.begun_s = 0.0  # restart the timeout of cells when the daemon is back
+            request.begun_s = 0.0  # restart the timeout of cells when the daemon is back
             self._try_again(request)
             self._stop.wait(_AGAIN_S)
             return
@@ -189,15 +189,15 @@ class Worker(ABC):
                 done()
 
     def _try_again(self, request: Request) -> None:
-        request.tries.was_requeued = True
+        request.was_requeued = True
         self._waiting.requeue(request)
 
-    def _has_failed(self, tries: Tries) -> bool:
+    def _has_failed(self, request: Request) -> bool:
         """Return whether the request fails by itself, not because the daemon is away."""
-        if self._answered > tries.answers:
-            tries.answers = self._answered
-            tries.failed += 1
-        return tries.failed >= _MAX_FAILED
+        if self._answered > request.answers:
+            request.answers = self._answered
+            request.failed += 1
+        return request.failed >= _MAX_FAILED
 
     def _guarded_tick(self) -> None:
         try:

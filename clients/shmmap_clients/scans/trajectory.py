@@ -5,9 +5,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -111,6 +110,29 @@ def tum_line(stamp_s: float, T_map_sensor: NDArray[np.float64]) -> str:
     return " ".join([f"{stamp_s:.9f}", *(f"{float(v):.9f}" for v in numbers)])
 
 
+def _lines(name: str, cause: str) -> Iterator[tuple[int, str]]:
+    """Yield the lines of a text file with their numbers, without comments and empty lines.
+
+    Raises
+    ------
+    MapMissing
+        There is no such file.
+    MapDataError
+        The file cannot be read; the error has this ``cause``.
+    """
+    try:
+        with open(name, encoding="utf-8-sig") as file:
+            for number, line in enumerate(file, 1):
+                if text := line.partition("#")[0].strip():
+                    yield number, text
+    except FileNotFoundError:
+        raise MapMissing(f"there is no file {name}") from None
+    except OSError as error:
+        raise MapDataError(f"{name}: cannot be read: {error.strerror}", cause=cause) from error
+    except UnicodeDecodeError:
+        raise MapDataError(f"{name}: not a text file", cause=cause) from None
+
+
 def read_trajectory(path: str | os.PathLike[str]) -> Trajectory:
     """Read a TUM file; empty lines and lines that begin with ``#`` are skipped.
 
@@ -124,29 +146,16 @@ def read_trajectory(path: str | os.PathLike[str]) -> Trajectory:
     name = os.fspath(path)
     stamps: list[float] = []
     poses: list[NDArray[np.float64]] = []
-    try:
-        with open(name, encoding="utf-8") as file:
-            for number, line in enumerate(file, 1):
-                text = line.partition("#")[0].strip()
-                if not text:
-                    continue
-                try:
-                    values = [float(word) for word in text.split()]
-                except ValueError:
-                    values = []
-                good = len(values) == 8 and all(math.isfinite(value) for value in values)
-                if not good or abs(math.hypot(*values[4:]) - 1.0) > _NORM_TOLERANCE:
-                    raise MapDataError(
-                        f"{name}, line {number}: not `t tx ty tz qx qy qz qw`", cause="trajectory"
-                    )
-                stamps.append(values[0])
-                poses.append(matrix_of(values[1:4], values[4:]))
-    except FileNotFoundError:
-        raise MapMissing(f"there is no file {name}") from None
-    except OSError as error:
-        raise MapDataError(f"{name}: cannot be read: {error.strerror}", cause="trajectory") from error
-    except UnicodeDecodeError:
-        raise MapDataError(f"{name}: not a text file", cause="trajectory") from None
+    for number, text in _lines(name, "trajectory"):
+        try:
+            values = [float(word) for word in text.split()]
+        except ValueError:
+            values = []
+        good = len(values) == 8 and all(math.isfinite(value) for value in values)
+        if not good or abs(math.hypot(*values[4:]) - 1.0) > _NORM_TOLERANCE:
+            raise MapDataError(f"{name}, line {number}: not `t tx ty tz qx qy qz qw`", cause="trajectory")
+        stamps.append(values[0])
+        poses.append(matrix_of(values[1:4], values[4:]))
     if not stamps:
         raise MapDataError(f"{name}: no poses", cause="trajectory")
     return Trajectory(np.array(stamps), np.array(poses).reshape(-1, 4, 4))
@@ -172,20 +181,10 @@ def read_route(path: str | os.PathLike[str]) -> NDArray[np.float64]:
     name = os.fspath(path)
     if not name.lower().endswith(".csv"):
         return read_trajectory(name).T_map_sensor[:, :2, 3]
-    try:
-        lines = Path(name).read_text(encoding="utf-8-sig").splitlines()
-    except FileNotFoundError:
-        raise MapMissing(f"there is no file {name}") from None
-    except OSError as error:
-        raise MapDataError(f"{name}: cannot be read: {error.strerror}", cause="route") from error
-    except UnicodeDecodeError:
-        raise MapDataError(f"{name}: not a text file", cause="route") from None
     places: list[tuple[float, float]] = []
     columns: tuple[int, int] | None = None
-    for number, line in enumerate(lines, 1):
-        words = [word.strip() for word in line.partition("#")[0].split(",")]
-        if words == [""]:
-            continue
+    for number, text in _lines(name, "route"):
+        words = [word.strip() for word in text.split(",")]
         if columns is None:
             names = [word.strip('"').lower() for word in words]
             columns = (names.index("x"), names.index("y")) if {"x", "y"} <= {*names} else (0, 1)

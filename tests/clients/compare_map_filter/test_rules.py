@@ -21,6 +21,7 @@ ORIGINS = {
     "MGRS": (89_560.0, 42_340.0, 12.0),
     "UTM": (-512_000.0, 4_427_000.0, 430.0),
 }
+DISTANCES = ((0.3, 1.0), (0.7, 2.5), (1.0, 0.25))
 
 
 def brute_force(
@@ -69,13 +70,18 @@ def scan_points(rng: np.random.Generator, origin: tuple[float, float, float]) ->
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("place", ORIGINS)
+@pytest.mark.parametrize(
+    ("place", "distance", "z_ratio"),
+    [*((place, 0.5, 0.5) for place in ORIGINS), *(("origin", *one) for one in DISTANCES)],
+)
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_equals_brute_force(mode: str, place: str, dtype: type[np.floating[Any]]) -> None:
+def test_equals_brute_force(
+    mode: str, place: str, dtype: type[np.floating[Any]], distance: float, z_ratio: float
+) -> None:
     rng = np.random.default_rng(7)
     origin = ORIGINS[place]
     clouds = town_of_cells(rng, origin, dtype)
-    rule = CompareRule(mode, 0.5, 0.5)
+    rule = CompareRule(mode, distance, z_ratio)
     tables = [build_layer(rule.layer, cloud) for cloud in clouds]
     voxel = f"voxel(leaf_x={rule.distance},leaf_y={rule.distance},leaf_z={rule.distance_z})"
     centroids = [np.asarray(build_layer(voxel, cloud)["xyz"]) for cloud in clouds]
@@ -88,33 +94,6 @@ def test_equals_brute_force(mode: str, place: str, dtype: type[np.floating[Any]]
         assert np.array_equal(~got.kept, expected), backend
         assert got.cells == 8
         assert np.array_equal(got.indices, np.flatnonzero(~expected))
-
-
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize(("distance", "z_ratio"), [(0.3, 1.0), (0.7, 2.5), (1.0, 0.25)])
-def test_other_distances(mode: str, distance: float, z_ratio: float) -> None:
-    rng = np.random.default_rng(3)
-    clouds = town_of_cells(rng, (0.0, 0.0, 0.0), np.float32)
-    rule = CompareRule(mode, distance, z_ratio)
-    voxel = f"voxel(leaf_x={distance},leaf_y={distance},leaf_z={rule.distance_z})"
-    centroids = [np.asarray(build_layer(voxel, cloud)["xyz"]) for cloud in clouds]
-    points = scan_points(rng, (0.0, 0.0, 0.0)).astype(np.float32)
-    expected = brute_force(points, rule, clouds, centroids)
-    tables = [build_layer(rule.layer, cloud) for cloud in clouds]
-    for backend in ("numba", "numpy"):
-        got = CompareMapFilter(rule, backend=backend).use_tables(tables).apply(points)
-        assert np.array_equal(~got.kept, expected), backend
-
-
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("backend", ["numba", "numpy"])
-def test_a_neighbour_across_the_border_counts(mode: str, backend: str) -> None:
-    left, right = np.array([[19.9, 5.0, 0.1]], np.float32), np.array([[35.0, 5.0, 0.1]], np.float32)
-    rule = CompareRule(mode)
-    tables = [build_layer(rule.layer, cloud) for cloud in (left, right)]
-    compare = CompareMapFilter(rule, backend=backend).use_tables(tables)
-    points = np.array([[20.2, 5.0, 0.1], [20.6, 5.0, 0.1], [34.8, 5.1, 0.1]], np.float32)
-    assert compare.apply(points).kept.tolist() == [False, True, False]
 
 
 def test_exactly_the_distance_is_explained_and_exactly_a_voxel_is_not() -> None:

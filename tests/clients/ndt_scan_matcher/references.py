@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from shmmap_clients.ndt_scan_matcher import Settings, VoxelMap, matrix_from_pose, voxel_cell
+from shmmap_clients.ndt_scan_matcher import Result, Settings, VoxelMap, matrix_from_pose, voxel_cell
 from shmmap_clients.ndt_scan_matcher.matching.evaluation import Neighbors
 
 from shmmap import read_cloud
@@ -36,10 +36,8 @@ def usable(row: dict[str, Any]) -> bool:
     return "DIRECT26" not in row["name"] and "ls=1" not in row["name"]
 
 
-def settings_of(
-    row: dict[str, Any],
-) -> tuple[Settings, NDArray[np.float64], int, NDArray[np.float64], float]:
-    """What a reference was aligned with: settings and guess; and its iterations, pose and score."""
+def settings_of(row: dict[str, Any]) -> tuple[Settings, NDArray[np.float64]]:
+    """Settings and guess that a reference was aligned with."""
     if "program" in row:
         settings = Settings(
             "autoware" if row["program"] == "autoware" else "pclomp",
@@ -47,8 +45,7 @@ def settings_of(
             epsilon=row["epsilon"],
             max_iterations=row["max_iterations"],
         )
-        guess, T = np.array(row["guess"]), np.array(row["T"]).reshape(3, 4)
-        return settings, matrix_from_pose(guess), row["iterations"], T, row["transform_probability"]
+        return settings, matrix_from_pose(np.array(row["guess"]))
     settings = Settings(
         "autoware" if row["name"].startswith("autoware") else "pclomp",
         next(ours for theirs, ours in SEARCH.items() if theirs in row["name"]),
@@ -57,8 +54,21 @@ def settings_of(
         step_size=row["step_size"],
     )
     x, y, z, yaw = row["guess_xyz_yaw"]
-    guess = matrix_from_pose(np.array([x, y, z, 0.0, 0.0, yaw]))
-    return settings, guess, row["iters"], np.array(row["T"]), row["tp"]
+    return settings, matrix_from_pose(np.array([x, y, z, 0.0, 0.0, yaw]))
+
+
+def assert_as_the_original(
+    result: Result, row: dict[str, Any], t: float = 1e-4, R: float = 1e-5, score: float = 1e-4
+) -> None:
+    """Compare a result with what the original found: metres, elements of the rotation, scores per point."""
+    T = np.array(row["T"]).reshape(-1, 4)
+    assert result.iterations == row.get("iterations", row.get("iters")), row
+    np.testing.assert_allclose(result.T_map_base[:3, 3], T[:3, 3], atol=t, err_msg=str(row))
+    np.testing.assert_allclose(result.T_map_base[:3, :3], T[:3, :3], atol=R, err_msg=str(row))
+    probability = row["transform_probability"] if "transform_probability" in row else row["tp"]
+    assert abs(result.transform_probability - probability) <= score, row
+    if "nvtl" in row:
+        assert abs(result.nvtl - row["nvtl"]) <= score, row
 
 
 def reference_rows(folder: Path) -> list[dict[str, Any]]:

@@ -19,6 +19,11 @@ from shmmap_clients.ndt_scan_matcher.drive.follower import Frame
 
 Points = NDArray[np.float64]
 
+TRUTH = np.array([1.3, 0.4, 1.8, 0.02, -0.03, 0.4])
+"""Pose of a scan in the street."""
+NEAR = TRUTH + np.array([0.2, -0.15, 0.1, 0.01, 0.02, -0.03])
+GUESS = matrix_from_pose(TRUTH + np.array([0.4, -0.3, 0.2, 0.01, 0.02, -0.04]))
+
 
 def street(seed: int = 1) -> Points:
     """Points of a street of 60 m x 24 m about the origin, 1 cm of noise, (N, 3), metres."""
@@ -39,13 +44,18 @@ def street(seed: int = 1) -> Points:
     return points + rng.normal(0, 0.01, points.shape)
 
 
-def cells_of(points: NDArray[np.floating], leaf: float, edge: float = 20.0) -> dict[str, VoxelCell]:
-    """Cut a cloud into square cells and compute the Gaussians of each."""
+def squares_of(points: NDArray[np.floating], edge: float = 20.0) -> dict[str, NDArray[np.floating]]:
+    """Cut a cloud into square cells."""
     index = np.floor(points[:, :2] / edge).astype(int)
     return {
-        f"{i}_{j}": voxel_cell(points[(index == (i, j)).all(axis=1)], leaf)
+        f"{i}_{j}": points[(index == (i, j)).all(axis=1)]
         for i, j in sorted({(int(i), int(j)) for i, j in index})
     }
+
+
+def cells_of(points: NDArray[np.floating], leaf: float, edge: float = 20.0) -> dict[str, VoxelCell]:
+    """Cut a cloud into square cells and compute the Gaussians of each."""
+    return {name: voxel_cell(cloud, leaf) for name, cloud in squares_of(points, edge).items()}
 
 
 def map_of(points: NDArray[np.floating], leaf: float, edge: float = 20.0) -> VoxelMap:
@@ -66,6 +76,24 @@ def worth(backend: Backend, pose: NDArray[np.float64], scoring: Scoring) -> Eval
     """The evaluation of one pose."""
     (at,) = backend.evaluate(pose[None], scoring)
     return at
+
+
+def counts(at: Evaluation) -> tuple[int, int, int, int]:
+    """Points and neighbours of an evaluation, used and cut off."""
+    return at.found, at.neighbours, at.cut_points, at.cut_neighbours
+
+
+def off(found: Evaluation, wanted: Evaluation) -> float:
+    """The largest difference, relative to the largest element."""
+    pairs = ((found.gradient, wanted.gradient), (found.hessian, wanted.hessian))
+    scores = [abs(found.score / wanted.score - 1), abs(found.nearest / wanted.nearest - 1)]
+    return max(*scores, *(float(np.abs(a - b).max() / np.abs(b).max()) for a, b in pairs))
+
+
+def same_bits(a: Evaluation, b: Evaluation) -> bool:
+    """Whether two evaluations are equal to the last bit."""
+    plain = (a.score, a.nearest, *counts(a)) == (b.score, b.nearest, *counts(b))
+    return plain and bool((a.gradient == b.gradient).all()) and bool((a.hessian == b.hessian).all())
 
 
 def frame(number: int, T: NDArray[np.float64], truth: NDArray[np.float64] | None) -> Frame:

@@ -25,10 +25,9 @@ from shmmap_clients.ndt_scan_matcher import (
     voxel_cell,
 )
 
-from tests.clients.ndt_scan_matcher.scene import scan_from, street
+from tests.clients.ndt_scan_matcher.scene import TRUTH, scan_from, street
 from tests.support.compiled_programs import PclNdt, build_pcl_ndt
 
-TRUTH = np.array([1.3, 0.4, 1.8, 0.02, -0.03, 0.4])
 LEAVES = (0.8, 1.0, 1.5, 2.0, 2.7, 4.0)
 
 Points = NDArray[np.float32]

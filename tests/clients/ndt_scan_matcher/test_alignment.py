@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 
@@ -21,22 +22,12 @@ from shmmap_clients.ndt_scan_matcher import (
     Settings,
     VoxelMap,
     matrix_from_pose,
-    pose_from_matrix,
 )
-from shmmap_clients.ndt_scan_matcher.matching.newton import StepRule, ascend, variant_named
+from shmmap_clients.ndt_scan_matcher.matching.newton import Ascent, StepRule, ascend, variant_named
 from shmmap_clients.ndt_scan_matcher.matching.result import covariance_of, oscillations
 
 import shmmap
-from tests.clients.ndt_scan_matcher.scene import cells_of, map_of, scan_from, street
-
-TRUTH = np.array([1.3, 0.4, 1.8, 0.02, -0.03, 0.4])
-GUESS = matrix_from_pose(TRUTH + np.array([0.4, -0.3, 0.2, 0.01, 0.02, -0.04]))
-
-
-@pytest.fixture(scope="module")
-def scan(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    # of another sampling of the same street: a scan never holds the map's own points
-    return scan_from(street(seed=7), TRUTH, 1500)
+from tests.clients.ndt_scan_matcher.scene import GUESS, TRUTH, cells_of, map_of
 
 
 def aligned(
@@ -124,6 +115,21 @@ def test_steady_steps_end_where_the_originals_do(
     np.testing.assert_allclose(steady.T_map_base, plain.T_map_base, atol=1e-3)
 
 
+def climbed(
+    evaluate: Callable[[NDArray[np.float64], float], Evaluation],
+    start: list[float],
+    *,
+    epsilon: float,
+    max_step: float,
+) -> Ascent:
+    """Climb by steady steps from a pose vector to the peak, which is at zero."""
+    rule = StepRule(variant_named("autoware"), epsilon, max_step, 30, False, steady=True)
+    ascent = ascend(matrix_from_pose(np.array(start)), evaluate, rule)
+    assert ascent.converged
+    np.testing.assert_allclose(ascent.pose, np.zeros(6), atol=1e-3)
+    return ascent
+
+
 def test_steady_steps_do_not_swing() -> None:
     # far from a peak of this score a Newton step leads away, and at 0.5 m steps past the peak
     def evaluate(pose: NDArray[np.float64], _sign: float) -> Evaluation:
@@ -131,14 +137,8 @@ def test_steady_steps_do_not_swing() -> None:
         hessian = value * (np.outer(pose, pose) / 0.09 - np.eye(6)) / 0.09
         return Evaluation(value, -value * pose / 0.09, hessian, 0.0, 1, 1, 0, 0)
 
-    guess = np.eye(4)
-    guess[:3, 3] = 0.55, 0.2, -0.1
-    rule = StepRule(variant_named("autoware"), 1e-3, 0.5, 40, False, steady=True)
-    ascent = ascend(guess, evaluate, rule)
-    assert ascent.converged
-    np.testing.assert_allclose(ascent.pose, np.zeros(6), atol=2e-3)
-    scores = [at.score for at in ascent.evaluations]
-    assert scores[-1] > 0.999
+    ascent = climbed(evaluate, [0.55, 0.2, -0.1, 0.0, 0.0, 0.0], epsilon=1e-3, max_step=0.5)
+    assert ascent.last.score > 0.999
 
 
 @pytest.mark.parametrize("start", [0.13, 0.22])
@@ -153,12 +153,7 @@ def test_steady_steps_do_not_bounce_between_the_sides_of_a_crease(start: float) 
         value = -steep * length - 0.5 * float(np.delete(pose, 1) @ np.delete(pose, 1))
         return Evaluation(value, gradient, hessian, 0.0, 1, 1, 0, 0)
 
-    guess = np.eye(4)
-    guess[:2, 3] = 0.8, start
-    rule = StepRule(variant_named("autoware"), 0.01, 0.1, 30, False, steady=True)
-    ascent = ascend(guess, evaluate, rule)
-    assert ascent.converged
-    np.testing.assert_allclose(ascent.pose, np.zeros(6), atol=2e-3)
+    ascent = climbed(evaluate, [0.8, start, 0.0, 0.0, 0.0, 0.0], epsilon=0.01, max_step=0.1)
     assert ascent.last.score == max(at.score for at in ascent.evaluations)
 
 
@@ -174,11 +169,7 @@ def test_a_steady_step_that_loses_much_is_not_taken() -> None:
             hessian += part * (np.outer(off, off) / 0.0004 - np.eye(6)) / 0.0004
         return Evaluation(value, gradient, hessian, 0.0, 1, 1, 0, 0)
 
-    guess = matrix_from_pose(np.array([0.0, 0.0, 0.0, 0.0, 0.0, -0.0199]))
-    rule = StepRule(variant_named("autoware"), 1e-4, 0.1, 30, False, steady=True)
-    ascent = ascend(guess, evaluate, rule)
-    assert ascent.converged
-    np.testing.assert_allclose(ascent.pose, np.zeros(6), atol=1e-3)
+    climbed(evaluate, [0.0, 0.0, 0.0, 0.0, 0.0, -0.0199], epsilon=1e-4, max_step=0.1)
 
 
 def test_the_same_pose_at_large_coordinates(points: NDArray[np.float64], scan: NDArray[np.float64]) -> None:
@@ -207,9 +198,11 @@ def test_no_map_is_no_pose(points: NDArray[np.float64], scan: NDArray[np.float64
         for voxel_map, guess in ((VoxelMap({}), GUESS), (map_of(points, 2.0), far)):
             result = aligned(voxel_map, scan, guess, Settings(mode="coarse_fine"), backend=backend)
             assert not result.converged
+            assert (result.no_map, result.failed_limits) == (True, ("no_map",))
             assert (result.T_map_base == guess).all()
             assert (result.iterations, result.nvtl, result.transform_probability) == (0, 0.0, 0.0)
             assert result.covariance is None
+        assert not aligned(VoxelMap({}), scan[:0], backend=backend).no_map, "no scan is not no map"
 
 
 def test_regularization_pulls_along_the_heading(
@@ -291,13 +284,3 @@ def test_wrong_requests_are_refused(points: NDArray[np.float64], scan: NDArray[n
         VoxelMap({"a": next(iter(a.values())), "b": next(iter(b.values()))})
     with pytest.raises(shmmap.BadRequest, match="span"):
         VoxelMap(cells_of(np.concatenate([points, points + 10_000.0]), 2.0))
-
-
-def test_pose_vectors_and_results_speak_of_the_same_pose(
-    points: NDArray[np.float64], scan: NDArray[np.float64]
-) -> None:
-    with NdtMatcher() as matcher:
-        matcher.set_map(map_of(points, 2.0))
-        result = matcher.align(scan, GUESS)
-        (again,) = matcher.evaluate(scan, pose_from_matrix(result.T_map_base)[None])
-        assert again.nvtl == pytest.approx(result.nvtl, rel=1e-9)

@@ -15,9 +15,8 @@ from shmmap_clients.ndt_scan_matcher import TrustLimits
 from shmmap_clients.ndt_scan_matcher.cli import main
 from shmmap_clients.ndt_scan_matcher.matching.settings import Limits
 
-from tests.clients.ndt_scan_matcher.scene import scan_from, street
+from tests.clients.ndt_scan_matcher.scene import TRUTH, scan_from, street
 
-TRUTH = np.array([1.3, 0.4, 1.8, 0.02, -0.03, 0.4])
 GUESS = "1.5,0.3,1.9,0.02,-0.03,0.42"
 
 

@@ -13,7 +13,6 @@ from shmmap_clients.ndt_scan_matcher import (
     NdtMatcher,
     Result,
     Settings,
-    TrustLimits,
     VoxelMap,
     matrix_from_pose,
     voxel_cell,
@@ -28,7 +27,6 @@ Points = NDArray[np.floating]
 
 TRUTH = np.array([1.0, -0.5, 1.8, 0.0, 0.0, 0.2])
 BESIDE = np.array([1.2, -0.6, 1.85, 0.0, 0.0, 0.21])
-NO_EVIDENCE = TrustLimits(points=0, distance=0.0, angle=0.0, sharpness=0.0, spread=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -58,10 +56,9 @@ def aligned(
     scan: Points,
     mode: str = "single",
     backend: str = "numba",
-    trust: TrustLimits | None = None,
 ) -> Result:
     settings = Settings(mode="coarse_fine" if mode == "coarse_fine" else "single", steady=True)
-    with NdtMatcher(settings, backend=backend, trust=trust) as matcher:
+    with NdtMatcher(settings, backend=backend) as matcher:
         matcher.set_map(map_of(points, 2.0))
         return matcher.align(scan, matrix_from_pose(BESIDE))
 
@@ -123,12 +120,6 @@ def test_a_tunnel_holds_nothing_lengthwise() -> None:
     seen = tunnel[np.abs(tunnel[:, 0]) < 25.0][::3]
     result = aligned(tunnel, seen - TRUTH[:3], "coarse_fine")
     assert "sharpness" in result.failed_limits or "spread" in result.failed_limits, result.evidence
-
-
-def test_the_limits_can_be_lifted(points: Points, scan: Points) -> None:
-    assert "distance" in aligned(points, within(scan, 6.0)).failed_limits
-    lifted = aligned(points, within(scan, 6.0), trust=NO_EVIDENCE)
-    assert not {"points", "distance", "angle", "sharpness", "spread"} & set(lifted.failed_limits)
 
 
 def test_evidence_does_not_depend_on_the_number_of_points_or_the_heading(

@@ -34,11 +34,19 @@ from shmmap_clients.ndt_scan_matcher.matching import newton
 from shmmap_clients.ndt_scan_matcher.matching.pose_batch import derivatives_of_poses, matrices_from_poses
 
 import shmmap
-from tests.clients.ndt_scan_matcher.scene import cells_of, frame, map_of, scan_from, street, worth
+from tests.clients.ndt_scan_matcher.scene import (
+    GUESS,
+    TRUTH,
+    cells_of,
+    frame,
+    map_of,
+    same_bits,
+    scan_from,
+    street,
+    worth,
+)
 from tests.support.opencl_device import need_device
 
-TRUTH = np.array([1.3, 0.4, 1.8, 0.02, -0.03, 0.4])
-GUESS = matrix_from_pose(TRUTH + np.array([0.4, -0.3, 0.2, 0.01, 0.02, -0.04]))
 HOW = Scoring("radius", "autoware")
 
 
@@ -130,10 +138,7 @@ def test_more_poses_than_the_limit_are_refused_at_once_and_split_by_the_matcher(
         matcher.set_map(map_of(points, 2.0))
         together = matcher.evaluate(scan, poses)
     for pose, found in zip(poses, together, strict=True):
-        alone = worth(one, pose, HOW)
-        assert found.score == alone.score
-        assert (found.gradient == alone.gradient).all()
-        assert (found.hessian == alone.hessian).all()
+        assert same_bits(found, worth(one, pose, HOW))
 
 
 def test_limits_that_make_no_sense_are_refused() -> None:

@@ -36,11 +36,10 @@ from shmmap_clients.ndt_scan_matcher.backends.registry import FallbackBackend
 from shmmap_clients.ndt_scan_matcher.cli import main
 
 import shmmap
-from tests.clients.ndt_scan_matcher.scene import map_of, scan_from, worth
+from tests.clients.ndt_scan_matcher.scene import TRUTH, map_of, scan_from, worth
 from tests.support.opencl_device import need_device
 from tests.support.process_costs import anonymous_bytes, descriptors
 
-TRUTH = np.array([1.3, 0.4, 1.8, 0.02, -0.03, 0.4])
 HOW = Scoring("radius", "autoware")
 COPY = DeviceOptions(memory="copy")
 ROOT = Path(__file__).parents[3]

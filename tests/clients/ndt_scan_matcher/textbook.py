@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Textbook"]
+__all__ = ["Textbook", "rotation"]
 
 _LEAST_POINTS = 6
 _LEAST_RATIO = 0.01  # of a covariance's eigenvalues, section 6.2.1
@@ -38,24 +39,27 @@ def _covariance(points: Array, convention: str) -> Array:
 
 
 class Textbook:
-    """The Gaussians of a cloud.
+    """The Gaussians of clouds; where a border cuts a voxel, each cloud has its own part.
 
     Parameters
     ----------
-    cloud : (N, 3) float64
+    clouds
+        (N, 3) float64 each.
     leaf
         Metres.
     convention
         Whose covariances: ``"pcl"`` (the textbook's), ``"pclomp"`` or ``"autoware"``.
     """
 
-    def __init__(self, cloud: Array, leaf: float, convention: str) -> None:
+    def __init__(self, clouds: Iterable[NDArray[np.floating]], leaf: float, convention: str) -> None:
         members: dict[tuple[int, ...], list[Array]] = defaultdict(list)
-        for point in cloud:
-            members[tuple(int(v) for v in np.floor(point / leaf))].append(point)
+        for number, cloud in enumerate(clouds):
+            for point in cloud:
+                index = (number, *(int(v) for v in np.floor(point / leaf)))
+                members[index].append(point)
         self.leaf = leaf
         kept = {index: np.array(points) for index, points in members.items() if len(points) >= _LEAST_POINTS}
-        self.index = np.array(list(kept))
+        self.index = np.array(list(kept))[:, 1:]
         self.mean = np.array([points.mean(axis=0) for points in kept.values()])
         inverses = []
         for points in kept.values():
@@ -79,13 +83,13 @@ class Textbook:
         a, b = np.nonzero(hit)
         return a, b
 
-    def score(
+    def shares(
         self, points: Array, pose: Array, pairs: tuple[NDArray[np.int64], NDArray[np.int64]]
-    ) -> complex:
-        """Eq. 6.9, summed over the pairs, with the sign of the programs: more is better."""
+    ) -> NDArray[np.inexact]:
+        """Eq. 6.9 of each pair, with the sign of the programs: more is better."""
         d = _moved(points, pose)[pairs[0]] - self.mean[pairs[1]]
         exponent = np.einsum("ni,nij,nj->n", d, self.inverse[pairs[1]], d)
-        return complex(-self.d1 * np.exp(-self.d2 / 2 * exponent).sum())
+        return np.asarray(-self.d1 * np.exp(-self.d2 / 2 * exponent))
 
     def derivatives(self, points: Array, pose: Array, neighbors: str) -> tuple[float, Array, Array]:
         """Score, gradient and Hessian at a pose vector."""
@@ -93,16 +97,22 @@ class Textbook:
 
         def gradient(at: Array) -> Array:
             steps = np.eye(6) * 1j * _COMPLEX_STEP
-            return np.array([self.score(points, at + step, pairs).imag for step in steps]) / _COMPLEX_STEP
+            imaginary = [self.shares(points, at + step, pairs).sum().imag for step in steps]
+            return np.array(imaginary) / _COMPLEX_STEP
 
         ahead, behind = (np.array([gradient(pose + s * _STEP * e) for e in np.eye(6)]) for s in (1, -1))
-        return self.score(points, pose, pairs).real, gradient(pose), (ahead - behind) / (2 * _STEP)
+        score = float(self.shares(points, pose, pairs).sum())
+        return score, gradient(pose), (ahead - behind) / (2 * _STEP)
 
 
-def _moved(points: Array, pose: NDArray[np.inexact]) -> NDArray[np.inexact]:
-    """Points at a pose that may be complex, R = Rx Ry Rz."""
-    (cr, cp, cy), (sr, sp, sy) = np.cos(pose[3:]), np.sin(pose[3:])
+def rotation(angles: NDArray[np.inexact]) -> NDArray[np.inexact]:
+    """Rx Ry Rz of roll, pitch and yaw, which may be complex."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(angles), np.sin(angles)
     rx = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
     ry = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
     rz = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
-    return np.asarray(points @ (rx @ ry @ rz).T + pose[:3])
+    return np.asarray(rx @ ry @ rz)
+
+
+def _moved(points: Array, pose: NDArray[np.inexact]) -> NDArray[np.inexact]:
+    return np.asarray(points @ rotation(pose[3:]).T + pose[:3])

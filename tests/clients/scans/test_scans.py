@@ -137,12 +137,6 @@ def test_poses_go_to_scans_by_place_or_by_number(tmp_path: Path) -> None:
         ScanSequence(tmp_path / "empty")
 
 
-def test_scans_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
-    names = ["b_1", "s_8", "s_9", "s_9_1", "s_9_10", "s_10", "s_11", "s_0012"]
-    write_scans(tmp_path / "a", sorted(names))
-    assert [scan.name for scan in ScanSequence(tmp_path / "a")] == names
-
-
 def test_files_that_are_no_scans_are_named(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     np.savez_compressed(tmp_path / "good.npz", xyz=rng.normal(size=(5000, 3)))
@@ -214,9 +208,9 @@ def test_scans_over_a_socket(tmp_path: Path) -> None:
             publisher.send(Scan(f"s{n}", n, make_scan().columns))
         publisher.send(None)
         assert [scan.name for scan in subscriber] == ["s0", "s1", "s2"]
-    with pytest.raises(BadRequest):
+    with pytest.raises(BadRequest, match="cannot bind"):
         ScanPublisher("nowhere")
-    with pytest.raises(BadRequest):
+    with pytest.raises(BadRequest, match="cannot connect"):
         ScanSubscriber("nowhere")
 
 

@@ -26,6 +26,7 @@ from shmmap_clients.ndt_scan_matcher.cli.align import add_alignment_options, mat
 from shmmap_clients.shared_options import (
     FAILED_LIMITS,
     add_height_option,
+    add_json_lines_option,
     add_leaf_option,
     add_pose_format_option,
     add_pose_option,
@@ -378,9 +379,7 @@ def _add_output_options(parser: argparse.ArgumentParser) -> None:
     out.add_argument(
         "--plot", type=output_file, metavar="FILE", help="write an SVG of the path, errors and latency"
     )
-    out.add_argument(
-        "--json-lines", metavar="FILE", help="write a line of JSON for each scan (-: to standard output)"
-    )
+    add_json_lines_option(out)
     add_quiet_option(out)
     add_allow_empty(parser)
     add_json_option(parser)

@@ -14,7 +14,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Final
 
@@ -35,6 +35,7 @@ _STEP_S: Final = 5.0  # interval of asking the daemon whether a map is still bei
 _ARRIVAL_S: Final = 60.0
 
 
+@dataclass(slots=True)
 class UpdateStatistics:
     """Statistics of the changes of the map in use.
 
@@ -53,23 +54,17 @@ class UpdateStatistics:
     private_bytes
         Largest private memory of this process for a map.
     uploads
-        Counts of writes to a device, including maps written again.
-
-    Parameters
-    ----------
-    uploads
-        Object that has these counts.
+        Counts of writes to a device, including maps written again; the object is updated in place.
     """
 
-    def __init__(self, uploads: UploadStatistics | None = None) -> None:
-        self.updates = 0
-        self.added = 0
-        self.removed = 0
-        self.request_ms = RunningSpread()
-        self.build_ms = RunningSpread()
-        self.prepare_ms = RunningSpread()
-        self.private_bytes = 0
-        self.uploads = uploads if uploads is not None else UploadStatistics()
+    uploads: UploadStatistics = field(default_factory=UploadStatistics)
+    updates: int = 0
+    added: int = 0
+    removed: int = 0
+    request_ms: RunningSpread = field(default_factory=RunningSpread)
+    build_ms: RunningSpread = field(default_factory=RunningSpread)
+    prepare_ms: RunningSpread = field(default_factory=RunningSpread)
+    private_bytes: int = 0
 
     def add(
         self,
@@ -171,7 +166,7 @@ class MapUpdater:
         route: NDArray[np.float64] | Sequence[tuple[float, float]] = (),
     ) -> None:
         self.rules = rules if rules is not None else MapRules()
-        self.statistics = UpdateStatistics(uploads)
+        self.statistics = UpdateStatistics(uploads if uploads is not None else UploadStatistics())
         self.too_slow = 0
         self._prepare = prepare
         self._route = route
@@ -292,13 +287,11 @@ class MapUpdater:
                 self._changed.wait_for(lambda: self._asked is not None or self._closing, _REFRESH_S)
                 if self._closing:
                     return
-                asked, self._asked = self._asked, None
-                self._busy = True
-                if asked is None and self._failed is not None:
-                    asked = self._failed
-                elif asked is None and self._latest is not None:
+                asked = self._asked or self._failed
+                if asked is None and self._latest is not None:
                     asked = (*self._latest[1], *self._velocity)  # to detect a change of the map itself
-                self._failed = None
+                self._asked = self._failed = None
+                self._busy = True
             if asked is not None:
                 self._update(*asked)
             with self._changed:

@@ -8,8 +8,7 @@ each lattice column (i, j), which cells have it.  A column on a border belongs t
 voxels are never merged: both Gaussians count, as in Autoware.
 
 Private memory: 210 bytes a cell, 4 bytes a lattice column, and 48 bytes a voxel where the covariances
-differ from those of the cells.  A new map copies the addresses of shared cells from the last one, in
-arrays: Python's own integers would take several times as much memory.
+differ from those of the cells.
 """
 
 from __future__ import annotations
@@ -116,13 +115,11 @@ def cell_from_layer(layer: LayerTable | Cell) -> VoxelCell:
     """
     from shmmap import Cell
 
-    lattice = layer.header.lattice if isinstance(layer, Cell) else layer.lattice
+    lattice = layer.lattice
     if lattice is None or len(set(lattice.leaf)) != 1:
         raise BadRequest("this layer has no voxels of one edge length", hint="ask for ndt(leaf=...)")
     try:
-        arrays: list[Any] = [
-            layer[name] for name in ("table", "mean", "inverse_covariance", "scatter", "count")
-        ]
+        arrays: list[Any] = [layer[name] for name in _COLUMNS]
     except KeyError as error:
         raise BadRequest(f"this is no ndt layer: {error.args[0]}", hint="ask for ndt(leaf=...)") from None
     table, mean, inverse, scatter, count = arrays
@@ -152,7 +149,7 @@ class VoxelMap:
     centre
         (x, y), metres, map frame; by default the middle of all cells.
     previous
-        A map whose derived tables are reused for the cells in both maps.
+        A map whose derived covariances are reused for the cells in both maps.
     derived
         Precomputed inverse covariances, by a cell's key and their kind.
 
@@ -199,23 +196,6 @@ class VoxelMap:
         self.boxes = _boxes(list(kept.values()))
         self.box, self.column_start, self.column_cell = _directory(self.boxes)
         self._tables: dict[Covariance, NDArray[np.int64]] = {}
-        self._inherited: dict[Covariance, tuple[NDArray[np.int64], NDArray[np.int64]]] = {}
-        if previous is not None:
-            self._inherit(previous)
-
-    def _inherit(self, previous: VoxelMap) -> None:
-        """Record the addresses of cells that the previous map also has, and their rows in this map."""
-        places = {key: row for row, key in enumerate(previous.cells)}
-        same = np.array(
-            [
-                (row, places[key])
-                for row, (key, cell) in enumerate(self.cells.items())
-                if previous.cells.get(key) is cell
-            ],
-            np.int64,
-        ).reshape(-1, 2)
-        for covariance, table in list(previous._tables.items()):
-            self._inherited[covariance] = same[:, 0], table[same[:, 1], :_ADDRESSES]
 
     def inverses(self, key: str, covariance: Covariance) -> NDArray[np.float64]:
         """Return (V, 6) inverse covariances of a cell; the cell's own array if it has this kind."""
@@ -235,16 +215,8 @@ class VoxelMap:
         if table is None:
             table = np.zeros((len(self.cells), TABLE_COLUMNS), np.int64)
             table[:, _ADDRESSES:] = self.boxes
-            missing = np.ones(len(self.cells), bool)
-            inherited = self._inherited.pop(covariance, None)
-            if inherited is not None:
-                rows, addresses = inherited
-                table[rows, :_ADDRESSES] = addresses
-                missing[rows] = False
-            keys = list(self.cells)
-            for row in np.flatnonzero(missing).tolist():
-                key = keys[row]
-                table[row, :_ADDRESSES] = _addresses(self.cells[key], self.inverses(key, covariance))
+            for row, (key, cell) in enumerate(self.cells.items()):
+                table[row, :_ADDRESSES] = _addresses(cell, self.inverses(key, covariance))
             self._tables[covariance] = table
         return table
 

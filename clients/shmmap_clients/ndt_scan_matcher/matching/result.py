@@ -41,7 +41,6 @@ __all__ = [
     "TrustLimits",
     "covariance_of",
     "default_nvtl",
-    "default_sharpness",
     "evidence_of",
     "extent_of",
     "oscillations",
@@ -195,11 +194,6 @@ def default_nvtl(leaf: float, *, fine: bool = False) -> float:
     return share * -gauss_for(leaf).d1
 
 
-def default_sharpness(*, fine: bool = False) -> float:
-    """Return the lowest sharpness of a trusted result; ``fine`` as in `default_nvtl`."""
-    return _FINE_SHARPNESS if fine else _SHARPNESS
-
-
 @dataclass(frozen=True, slots=True)
 class TrustLimits:
     """Limits that a trusted result must meet.
@@ -215,7 +209,7 @@ class TrustLimits:
     oscillations
         Most reversals of the step.
     points, distance, angle, sharpness, spread
-        Least `Evidence`; None for ``sharpness``: `default_sharpness`.
+        Least `Evidence`; None for ``sharpness``: 2.7, or 3.4 for true covariances.
     """
 
     nvtl: float | None = None
@@ -238,7 +232,7 @@ class TrustLimits:
         return replace(
             self,
             nvtl=default_nvtl(leaf, fine=fine) if self.nvtl is None else self.nvtl,
-            sharpness=default_sharpness(fine=fine) if self.sharpness is None else self.sharpness,
+            sharpness=(_FINE_SHARPNESS if fine else _SHARPNESS) if self.sharpness is None else self.sharpness,
         )
 
     def failed(
