@@ -133,7 +133,8 @@ class Marker:
 
     def _forget(self) -> None:
         used = int(self._used[0])
-        kernels.clear(used, self._hits, self._misses)
+        self._hits[: used * WORDS] = 0
+        self._misses[: used * WORDS] = 0
         self._table[self._used[1 : used + 1]] = -1
         self._used[0] = 0
 

@@ -23,7 +23,7 @@ from shmmap.compiling import compiled, inlined, read_only
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["NO_SLOTS", "clear", "count_words", "mark_ends", "mark_rays", "window_codes", "write_words"]
+__all__ = ["NO_SLOTS", "count_words", "mark_ends", "mark_rays", "window_codes", "write_words"]
 
 NO_SLOTS: Final = -1
 _ZERO: Final = np.uint64(0)
@@ -272,10 +272,3 @@ def write_words(order: Any, hits: Any, misses: Any, bits: Any, words: Any) -> No
                     words[at] = word
                     which[slot * WORDS + word] = 0
                     at += 1
-
-
-@compiled(types.void(int64, uint64[::1], uint64[::1]))
-def clear(slots: Any, hits: Any, misses: Any) -> None:
-    """Clear all marks."""
-    hits[: slots * WORDS] = 0
-    misses[: slots * WORDS] = 0

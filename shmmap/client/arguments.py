@@ -139,7 +139,8 @@ def pose_intent(
     numbers_finite = all(map(math.isfinite, (pose.x, pose.y, pose.vx, pose.vy, angle or 0.0)))
     if not numbers_finite or not np.isfinite(path).all():
         raise BadRequest("pose: every number in it must be finite")
-    return _with_route(pose, path) if path.size else pose
+    places = tuple(map(tuple, thinned(path).tolist())) if path.size else ()
+    return msgspec.structs.replace(pose, route=places)
 
 
 def given_intent(
@@ -190,7 +191,3 @@ def thinned(route: NDArray[np.float64]) -> NDArray[np.float64]:
         return route[:1]
     places = np.linspace(0.0, along[-1], MAX_ROUTE_PLACES)
     return np.stack([np.interp(places, along, route[:, 0]), np.interp(places, along, route[:, 1])], axis=-1)
-
-
-def _with_route(intent: Intent, route: NDArray[np.float64]) -> Intent:
-    return msgspec.structs.replace(intent, route=tuple(map(tuple, thinned(route).tolist())))

@@ -171,7 +171,7 @@ class Attacher:
 def owner_of_segments(shm_dir: str, segment_prefix: str) -> int | None:
     """Return the user id that owns the segments, as this process sees it; None if it sees no segment."""
     try:
-        return os.lstat(_statistics_path(shm_dir, segment_prefix)).st_uid
+        return os.lstat(f"{shm_dir}/{segment_prefix.lstrip('/')}statistics").st_uid
     except OSError:
         return None
 
@@ -190,8 +190,3 @@ def check_visible(shm_dir: str, segment_prefix: str) -> None:
             hint="in a container mount the daemon's directory of segments, and name it with shm_dir or"
             " SHMMAP_SHM_DIR where its path differs",
         )
-
-
-def _statistics_path(shm_dir: str, segment_prefix: str) -> str:
-    """Return the path of a daemon's statistics segment, from the prefix of its segments' names."""
-    return f"{shm_dir}/{segment_prefix.lstrip('/')}statistics"

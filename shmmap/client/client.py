@@ -234,13 +234,14 @@ class Client:
         """
         specs, message = names("layers", layers), messages.area_to_message(area)
         sent = given_intent(pose, velocity, heading, route)
-        found = _waited(
-            wait,
+        return self._answer(
             lambda wait_s: self._session.ask_cells(
                 lambda n: messages.Area(n, message, specs, wait_s, sent), wait_s
             ),
+            area,
+            wait,
+            strict,
         )
-        return found if strict is None else self._judged(found, area, wait, strict)
 
     def points_around(
         self,
@@ -315,15 +316,15 @@ class Client:
         """
         specs, mine = names("layers", layers), HeldCells(held, by_name=by_name)
         sent = given_intent(pose, velocity, heading, route)
-        found = _waited(
-            wait,
+        return self._answer(
             lambda wait_s: self._session.ask_differential(
                 area, mine, specs, wait_s, sent, populate=populate, timeout_s=timeout
             ),
+            area,
+            wait,
+            strict,
+            new=not mine.named and not mine.packed,
         )
-        if strict is None:
-            return found
-        return self._judged(found, area, wait, strict, new=not mine.named and not mine.packed)
 
     def selected(
         self,
@@ -344,25 +345,35 @@ class Client:
         """
         specs = names("layers", layers)
         wanted, sent = names("ids", ids), given_intent(pose, velocity, heading, route)
-        found = _waited(
-            wait,
+        return self._answer(
             lambda wait_s: self._session.ask_cells(
                 lambda n: messages.Selected(n, wanted, specs, wait_s, sent), wait_s
             ),
+            None,
+            wait,
+            strict,
         )
-        return found if strict is None else self._judged(found, None, wait, strict)
 
-    def _judged(
+    def _answer(
         self,
-        found: CellSet,
+        ask: Callable[[float | None], CellSet],
         area: geometry.Area | None,
         wait: float | None,
-        strict: bool,
+        strict: bool | None,
         *,
         new: bool = True,
     ) -> CellSet:
-        """Return an answer; warn or raise if it is incomplete.  If not all is ``new``, it may be empty."""
-        if not found.complete or (new and not any(cell.points for cell in found.cells)):
+        """Repeat a request while cells are pending and ``wait`` is not over; return the last answer.
+
+        Unless ``strict`` is None, warn or raise if it is incomplete.  If not all is ``new``, it may be empty.
+        """
+        found = CellSet()
+        for wait_s in request_waits(wait):
+            found = ask(wait_s)
+            if not found.pending:
+                break
+        has_points = any(cell.points for cell in found.cells)
+        if strict is not None and (not found.complete or (new and not has_points)):
             from shmmap.lacking import judge
 
             judge(self, found, area, waited=bool(wait), strict=strict, new=new)
@@ -499,16 +510,6 @@ class Client:
             The daemon lets only administrators do this.
         """
         self._session.ask(messages.Shutdown, messages.Stopping)
-
-
-def _waited(wait: float | None, ask: Callable[[float | None], CellSet]) -> CellSet:
-    """Repeat a request while cells are pending and ``wait`` is not over; return the last answer."""
-    found = CellSet()
-    for wait_s in request_waits(wait):
-        found = ask(wait_s)
-        if not found.pending:
-            break
-    return found
 
 
 def connect(

@@ -41,16 +41,11 @@ R = TypeVar("R")
 
 _SLICE_MS: Final = 100  # interval at which silence is checked for a broken connection
 _RESEND_S: Final = 1.0  # first repetition on silence; the interval then doubles
-_RECONNECT_MS: Final = 20
-_RECONNECT_MAX_MS: Final = 500
 _QUEUE: Final = 64  # messages that may wait for a slow daemon
 _OPTIONS: Final = (
-    (zmq.LINGER, 0),
     (zmq.IMMEDIATE, 1),  # nothing queues up for an absent daemon
     (zmq.SNDHWM, _QUEUE),
     (zmq.RCVTIMEO, _SLICE_MS),
-    (zmq.RECONNECT_IVL, _RECONNECT_MS),
-    (zmq.RECONNECT_IVL_MAX, _RECONNECT_MAX_MS),
 )
 _SILENT_HINT: Final = "the daemon is stopped, hung, overloaded or gone: see `shmmap health`"
 _UPDATE_HINT: Final = "update the older of client and daemon"
@@ -261,13 +256,10 @@ class Connection:
         # libzmq retries after a broken connection, but not if the socket types are incompatible (SUB, for
         # example)
         if self._watch.foreign or (hung_up and self._hung_up):
-            raise self._no_daemon()
-
-    def _no_daemon(self) -> ProtocolMismatch:
-        return ProtocolMismatch(
-            f"{self.path}: what listens there is no shmmap daemon",
-            hint="is this the socket of another program?",
-        )
+            raise ProtocolMismatch(
+                f"{self.path}: what listens there is no shmmap daemon",
+                hint="is this the socket of another program?",
+            )
 
 
 def _slice_ms(deadline_s: float) -> int:

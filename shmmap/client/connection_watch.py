@@ -56,6 +56,8 @@ _EVENTS: Final = (
 )
 _OURS: Final = frozenset({_signal.SIGBUS, _signal.SIGFPE, _signal.SIGILL, _signal.SIGSEGV})
 """Signals that a thread's own faults cause; they must not be blocked."""
+_OPTIONS: Final = ((zmq.LINGER, 0), (zmq.RECONNECT_IVL, 20), (zmq.RECONNECT_IVL_MAX, 500))
+"""Options of every socket, milliseconds."""
 _LAST_WORDS_MS: Final = 100  # time for a last message to be delivered on closing
 CONNECTION: Final = "a connection to the daemon"
 FILES: Final = 10
@@ -122,7 +124,7 @@ class ConnectionWatch:
     endpoint
         Endpoint to which the socket connects.
     options
-        Options of the socket.
+        Further options of the socket.
     waiting
         Queues that receive None when the connection breaks; may change at any time.
     kind
@@ -222,7 +224,7 @@ class ConnectionWatch:
                 ends.callback(context.term)
                 socket = context.socket(kind)
                 ends.callback(socket.close, linger=_LAST_WORDS_MS)
-                for option, value in options:
+                for option, value in (*_OPTIONS, *options):
                     socket.setsockopt(option, value)
                 monitor = socket.get_monitor_socket(_EVENTS)
                 ends.callback(monitor.close, linger=0)

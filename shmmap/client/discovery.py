@@ -233,20 +233,15 @@ def _refusal(path: str, error: OSError) -> DaemonUnreachable | ProtocolMismatch:
     return NoSocket(f"{path}: {error.strerror}", hint=_START_HINT)
 
 
-def _is_request_socket(name: str) -> bool:
-    return name.endswith(".sock") and "." not in name.removesuffix(".sock")  # events' names have a dot
-
-
 def _other_instances(path: str) -> str:
     directory = os.path.dirname(path)
     if not (directory.endswith("/shmmap") or directory == SYSTEM_RUNTIME_DIR):
         return ""
     try:
-        others = sorted(
-            name.removesuffix(".sock") for name in os.listdir(directory) if _is_request_socket(name)
-        )
+        sockets = [name.removesuffix(".sock") for name in os.listdir(directory) if name.endswith(".sock")]
     except OSError:
         return ""
+    others = sorted(name for name in sockets if "." not in name)  # events' names have a dot
     if not others:
         return ""
     return (

@@ -36,15 +36,7 @@ __all__ = ["EventStream", "MissedEvents"]
 _TIMEOUT_S: Final = 5.0
 _SLICE_MS: Final = 100  # interval at which a wait checks whether another thread has closed the stream
 _QUEUE: Final = 4096  # events kept while the program does something else; the daemon remembers as many
-_RECONNECT_MS: Final = 20
-_RECONNECT_MAX_MS: Final = 500
-_OPTIONS: Final = (
-    (zmq.LINGER, 0),
-    (zmq.RCVHWM, _QUEUE),
-    (zmq.RECONNECT_IVL, _RECONNECT_MS),
-    (zmq.RECONNECT_IVL_MAX, _RECONNECT_MAX_MS),
-    (zmq.SUBSCRIBE, b""),
-)
+_OPTIONS: Final = ((zmq.RCVHWM, _QUEUE), (zmq.SUBSCRIBE, b""))
 
 
 class MissedEvents(msgspec.Struct, frozen=True):

@@ -265,7 +265,9 @@ class Session:
         versions = self.attacher.unmapped()
         self._reported = len(versions)
         if versions:
-            connection.send(messages.Release(connection.new_request(), _pack(versions)))
+            connection.send(
+                messages.Release(connection.new_request(), np.fromiter(versions, "<u8").tobytes())
+            )
             versions.clear()
 
     def whole_id(self, cell_id: str) -> str:
@@ -444,7 +446,3 @@ def _after_fork_in_child() -> None:
 
 
 os.register_at_fork(after_in_child=_after_fork_in_child)
-
-
-def _pack(versions: Iterable[int]) -> bytes:
-    return np.fromiter(versions, "<u8").tobytes()

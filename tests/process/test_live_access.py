@@ -9,7 +9,7 @@ import mmap
 import os
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +31,7 @@ from tests.support.accounts import (
 )
 from tests.support.daemon_process import DaemonProcess, Deadline
 from tests.support.live_drive import FILTER, RESOLUTION, drive
-from tests.support.live_reference import held, mapped_around, reference
+from tests.support.live_reference import held, map_scans, mapped_around, reference
 from tests.support.other_account import SCANS, as_client
 
 pytestmark = pytest.mark.root
@@ -88,20 +88,6 @@ def chunks_of(one: DaemonProcess) -> list[str]:
     ]  # fmt: skip
 
 
-@contextlib.contextmanager
-def opened(paths: Iterable[str]) -> Iterator[list[str]]:
-    """Other paths of files, whatever becomes of their names meanwhile; those that are gone are left out."""
-    files: list[int] = []
-    for path in paths:
-        with contextlib.suppress(FileNotFoundError):
-            files.append(os.open(path, os.O_RDONLY))
-    try:
-        yield [f"/proc/{os.getpid()}/fd/{fd}" for fd in files]
-    finally:
-        for fd in files:
-            os.close(fd)
-
-
 def marks_of(one: DaemonProcess) -> str:
     return f"{one.shm_dir}/shmmap-live.{one.instance}.marks"
 
@@ -147,10 +133,7 @@ def test_no_other_account_changes_what_is_in_memory(service: LiveService) -> Non
     one = service()
     with shmmap.connect(one.endpoint) as client:
         live = client.live("lidar")
-        with live.mapper("root", FILTER) as mapper:
-            for points, pose in drive(2):
-                mapper.add(points, pose)
-            mapper.wait_applied()
+        map_scans(live, drive(2), "root")
         here = settled(live, 1)
         before = held(live)
         path = f"{one.shm_dir}/shmmap-live.{one.instance}.lidar.{here.key.text}.{here.generation}"
@@ -190,10 +173,7 @@ def test_names_that_others_took_do_not_keep_a_daemon_from_starting(service: Live
     one = service()
     with shmmap.connect(one.endpoint) as client:
         live = client.live("lidar")
-        with live.mapper("front", FILTER) as mapper:
-            for points, pose in drive(2):
-                mapper.add(points, pose)
-            mapper.wait_applied()
+        map_scans(live, drive(2))
         before = held(live)
     start = f"{one.shm_dir}/shmmap-live.{one.instance}.lidar"
     content = Path(chunks_of(one)[0]).read_bytes() if chunks_of(one) else b"x"

@@ -16,18 +16,14 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
-import pytest
-
 import shmmap
-from tests.process.conftest import DaemonFactory
 from tests.support.chunk_memory import ChunkMemory as Unbounded
-from tests.support.daemon_process import ROOT, DaemonProcess, Deadline
+from tests.support.daemon_process import ROOT, Deadline
 from tests.support.live_drive import RESOLUTION, marked
 from tests.support.live_mapper import marks_of
-from tests.support.live_reference import held
+from tests.support.live_reference import LiveDaemon, held, worker_of
 
 KILLS = int(os.environ.get("SHMMAP_TEST_KILLS", "6"))
 SCANS_A_KILL = 12
@@ -92,34 +88,9 @@ class Mapper:
         self._process.communicate()
 
 
-def worker_of(one: DaemonProcess) -> int | None:
-    """Id of the live worker, if there is one just now."""
-    for pid in one.children():
-        with contextlib.suppress(OSError):
-            if b"live.worker" in Path(f"/proc/{pid}/cmdline").read_bytes():
-                return pid
-    return None
-
-
-@pytest.fixture
-def keep(daemon: DaemonFactory, tmp_path: Path) -> Callable[[], DaemonProcess]:
-    """Start a daemon with a live map that is paged all the time."""
-
-    def make() -> DaemonProcess:
-        file = tmp_path / "shmmap.toml"
-        file.write_text(
-            f"[live.lidar]\nresolution = {RESOLUTION}\nlinger_s = 0.05\ncheckpoint_s = 0.3\n"
-            f'path = "{tmp_path}/map"\n'
-        )
-        one: DaemonProcess = daemon("", "--config", str(file), "--live-budget", "4M")
-        return one
-
-    return make
-
-
-def test_any_process_is_killed_at_any_time(keep: Callable[[], DaemonProcess]) -> None:
+def test_any_process_is_killed_at_any_time(live_daemon: LiveDaemon, tmp_path: Path) -> None:
     rng = random.Random(KILLS)
-    one = keep()
+    one = live_daemon("--live-budget", "4M", checkpoint=0.3)  # paged all the time
     mapper = Mapper(one.endpoint, KILLS * SCANS_A_KILL)
     killed = dict.fromkeys(("mapper", "worker", "daemon"), 0)
     order = [name for name in killed for _ in range(-(-KILLS // 3))]
@@ -137,8 +108,9 @@ def test_any_process_is_killed_at_any_time(keep: Callable[[], DaemonProcess]) ->
             elif name == "daemon":
                 one.kill()
                 one.start()
-            elif (pid := worker_of(one)) is not None:
-                os.kill(pid, signal.SIGKILL)
+            else:
+                with contextlib.suppress(OSError, ValueError):  # there may be none just now
+                    os.kill(worker_of(one), signal.SIGKILL)
             killed[name] += 1
         waiting = Deadline()
         while waiting(not mapper.done):
@@ -160,5 +132,5 @@ def test_any_process_is_killed_at_any_time(keep: Callable[[], DaemonProcess]) ->
         assert held(live) == expected
         assert live.status().damaged == ()
     assert one.stop() == 0
-    left = os.listdir(Path(one.arguments[1]).parent / "map")
+    left = os.listdir(tmp_path / "lidar")
     assert not [name for name in left if not re.fullmatch(r"map\.json|manifest\.json|[-\d_]+\.chunk", name)]

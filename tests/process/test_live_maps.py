@@ -25,7 +25,7 @@ from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import Deadline
 from tests.support.forked_programs import run_verb
 from tests.support.live_drive import FILTER, RESOLUTION, drive, marked, walk
-from tests.support.live_reference import LiveDaemon, held, mapped_around, reference, worker_of
+from tests.support.live_reference import LiveDaemon, held, map_scans, mapped_around, reference, worker_of
 
 
 def test_a_drive_is_mapped_as_the_slow_reference_says(live_daemon: LiveDaemon) -> None:
@@ -87,10 +87,7 @@ def test_a_worker_killed_just_before_the_end_leaves_nothing_behind(
     one = live_daemon(checkpoint=600.0)
     with shmmap.connect(one.endpoint, timeout=60.0) as client:
         live = client.live("lidar")
-        with live.mapper("front", FILTER) as mapper:
-            for scan in drive(3):
-                mapper.add(*scan)
-            mapper.wait_applied()
+        map_scans(live, drive(3))
         expected = held(live)
     for _ in range(killed - 1):
         os.kill(worker_of(one), signal.SIGKILL)
@@ -139,9 +136,12 @@ TIMES = {"live.map": 3, "live.synced": 1, "live.flushed": 1}
 def test_a_worker_killed_at_any_step_loses_nothing(
     live_daemon: LiveDaemon, tmp_path: Path, label: str
 ) -> None:
-    """The mapper notices nothing but a pause: what was not answered it sends again, and it counts once."""
-    scans = drive(10)
-    one = live_daemon(start=False)
+    """The mapper notices nothing but a pause: what was not answered it sends again, and it counts once.
+
+    The map takes twice the memory that there is: chunks come and go all the time.
+    """
+    scans = drive()
+    one = live_daemon("--live-budget", "4M", start=False)
     one.environment["SHMMAP_TEST_CRASH"] = f"{label}:{TIMES.get(label, 5)}:{tmp_path}/reached"
     one.start()
     with shmmap.connect(one.endpoint) as client:
@@ -152,6 +152,8 @@ def test_a_worker_killed_at_any_step_loses_nothing(
             mapper.wait_applied()
             mapper.wait_durable()
         assert held(live) == held(live, "disk") == reference(scans)
+        assert "saved" in {chunk.state for chunk in live.chunks(saved=True)}, "some were given up"
+        assert live.status().bytes <= 4 << 20
     assert (tmp_path / "reached").exists(), "the step was never reached"
 
 
@@ -199,10 +201,8 @@ def test_mappers_side_by_side(live_daemon: LiveDaemon) -> None:
     one = live_daemon()
 
     def work(name: str, mine: list[tuple[np.ndarray, np.ndarray]]) -> None:
-        with shmmap.connect(one.endpoint) as client, client.live("lidar").mapper(name, FILTER) as mapper:
-            for points, pose in mine:
-                mapper.add(points, pose)
-            mapper.wait_applied()
+        with shmmap.connect(one.endpoint) as client:
+            map_scans(client.live("lidar"), mine, name)
 
     threads = [
         threading.Thread(target=work, args=("near", scans)), threading.Thread(target=work, args=("far", far))
@@ -234,19 +234,12 @@ def test_what_is_no_marks_is_refused_and_costs_only_its_sender(
                 messages.LiveApplied,
             )
 
-        os.mkfifo(directory / f"{mine}.1")
-        (directory / f"{mine}.2").symlink_to("/etc/passwd")
         (directory / f"{mine}.3").write_bytes(good[:-1])
         (directory / f"{mine}.4").write_bytes(bytes(len(good)))
-        (directory / f"{mine}.5").mkdir()
         (directory / f"{other.welcome.session:x}.6").write_bytes(good)
         for name, nbytes, said in (
-            (f"{mine}.1", 10, "no regular file"),
-            (f"{mine}.2", 10, "cannot be opened"),
             (f"{mine}.3", len(good), "has .* bytes, not"),
             (f"{mine}.4", len(good), "something else"),
-            (f"{mine}.5", 10, "no regular file"),
-            (f"{mine}.7", 10, "cannot be opened"),
             (f"{other.welcome.session:x}.6", len(good), "not a name that this session may use"),
             ("../shmmap.toml", 10, "not a name"),
             (f"{mine}.4", 1 << 40, "are the most"),
@@ -259,10 +252,6 @@ def test_what_is_no_marks_is_refused_and_costs_only_its_sender(
         (directory / f"{mine}.8").write_bytes(good)  # what was taken is removed
         assert send(f"{mine}.8", len(good)).scan == 1
         assert held(live) == reference(drive(1))
-        with pytest.raises(BadRequest, match="no live map 'radar'"):
-            client.live("radar")
-        with pytest.raises(BadRequest, match="frame 'map', not 'odom'"):
-            client.live("lidar", frame_id="odom")
     with shmmap.connect(one.endpoint) as client:  # their files are gone with their sessions
         waiting = Deadline()
         while waiting(any(name.startswith(mine) for name in os.listdir(directory))):
@@ -319,11 +308,7 @@ def test_an_operator_looks_and_saves(live_daemon: LiveDaemon) -> None:
     address = ("--endpoint", one.endpoint)
     assert "lidar" in shmmap_command("live", "ls", *address)
     with shmmap.connect(one.endpoint) as client:
-        live = client.live("lidar")
-        with live.mapper("front", FILTER) as mapper:
-            for points, pose in drive(3):
-                mapper.add(points, pose)
-            mapper.wait_applied()
+        map_scans(client.live("lidar"), drive(3))
         (row,) = json.loads(shmmap_command("live", "ls", "--json", *address))["maps"]
         assert (row["name"], row["scans"], row["mappers"]) == ("lidar", 3, [f"{os.getuid()}/front"])
         shown = shmmap_command("live", "show", "lidar", *address)

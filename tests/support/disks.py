@@ -10,6 +10,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from shmmap.daemon.live.disk.folder import Folder
+
 
 class PowerCut(BaseException):
     """The machine is off."""
@@ -23,8 +25,8 @@ class _File:
 
 
 @dataclass
-class CutDisk:
-    """Files of one directory (`shmmap.daemon.live.disk.folder.Files`); it fails after ``operations`` of them.
+class CutDisk(Folder):
+    """Files of one directory that is only in memory; it fails after ``operations`` of them.
 
     What is written is safe after `sync`, a name after `sync_names`.  After a cut, `after` gives the disk as
     it may be found: of the names that were changed since the last `sync_names` any are as before, and of a

@@ -1,37 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A drive for live maps, and a program that takes it in: it is killed, and says what was applied before.
-
-    python -m tests.support.live_drive SHM_DIRECTORY MAP_DIRECTORY BUDGET CHECKPOINT_S FIRST_SCAN
-
-It prints ``applied N`` and ``durable N`` for each scan; when all of it is on the disk how many chunks were
-given up and the most bytes that all took, and ``done``.
-"""
+"""A drive for live maps: as points and poses, as marks, and taken in by a map that is slow and right."""
 
 from __future__ import annotations
 
 import math
-import sys
-import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.chunks.chunk_file import decode_chunk
-from shmmap.chunks.layout import ChunkView, check_consistent
 from shmmap.chunks.marking import Marker
 from shmmap.chunks.marks import Marks
 from shmmap.chunks.occupancy import ScanFilter
-from shmmap.chunks.voxels import ChunkKey, voxels_of
-from shmmap.daemon.live.chunk_memory import ChunkMemory, live_prefix
-from shmmap.daemon.live.disk.folder import Folder
-from shmmap.daemon.live.disk.map_files import MapFiles
 from shmmap.daemon.live.disk.map_record import MapSettings
-from shmmap.daemon.live.paged_map import Observer, PagedMap
-from shmmap.daemon.live.paging.durability import Scan
-from shmmap.daemon.live.paging.residency import Limits
 
 RESOLUTION = 0.2
 SETTINGS = MapSettings(resolution=RESOLUTION)
@@ -57,83 +39,6 @@ def marked(scans: int = SCANS) -> list[Marks]:
     """The same as marks."""
     marker = Marker(RESOLUTION, FILTER)
     return [marker.mark(points, pose)[0] for points, pose in drive(scans)]
-
-
-class Observed:
-    """Notes what happens to a map; it may print it, too."""
-
-    def __init__(self, *, prints: bool = False) -> None:
-        self.gone: list[ChunkKey] = []
-        self._prints = prints
-
-    def scan_applied(self, scan: Scan) -> None:
-        if self._prints:
-            print(f"applied {scan.number}", flush=True)
-
-    def scan_durable(self, scan: Scan) -> None:
-        if self._prints:
-            print(f"durable {scan.number}", flush=True)
-
-    def chunk_changed(self, key: ChunkKey) -> None:
-        """Nothing is noted."""
-
-    def chunk_gone(self, key: ChunkKey) -> None:
-        self.gone.append(key)
-
-
-def opened(
-    shm: Path, disk: Path, budget: int, checkpoint_s: float = 1.0, observer: Observer | None = None
-) -> tuple[PagedMap, Folder]:
-    """Open the map, with what a previous process left."""
-    folder = Folder(disk)
-    limits = Limits(budget, linger_s=0.05, checkpoint_s=checkpoint_s, waiting_bytes=1)
-    memory = ChunkMemory(str(shm), live_prefix("test", "lidar"))
-    made = PagedMap(MapFiles(folder, SETTINGS), memory, limits, observer or Observed())
-    try:
-        made.adopt(time.monotonic())
-    except OSError:
-        made.close()
-        folder.close()
-        raise
-    return made, folder
-
-
-def voxels_on_disk(files: MapFiles, made: PagedMap) -> dict[Voxel, int]:
-    """All known voxels, by the chunks' files; every one of them can be read."""
-    found: dict[Voxel, int] = {}
-    for key in files.rows:
-        data = files.load(key)
-        assert data is not None
-        view = ChunkView(decode_chunk(data, made.identity(key, 1)))
-        check_consistent(view)
-        dense = view.dense()
-        places = np.flatnonzero(dense)
-        for voxel, value in zip(voxels_of(key, places).tolist(), dense[places].tolist(), strict=True):
-            found[voxel[0], voxel[1], voxel[2]] = value
-    return found
-
-
-def main() -> None:
-    """Take in the drive from a scan on, and save everything."""
-    shm, disk = map(Path, sys.argv[1:3])
-    observer = Observed(prints=True)
-    made, folder = opened(shm, disk, int(sys.argv[3]), float(sys.argv[4]), observer)
-    first = int(sys.argv[5])
-    waiting = list(enumerate(marked(), 1))[first - 1 :]
-    most = 0
-    poses = [pose for _, pose in drive()]
-    while waiting or not made.all_durable:
-        if waiting and made.residency.has_room(1):
-            number, marks = waiting.pop(0)
-            made.move("mapper", tuple(poses[number - 1][:3, 3].tolist()))
-            made.add(1, number, marks, 1)
-        made.run_turn(time.monotonic(), time.time_ns(), save_all=not waiting)
-        most = max(most, made.residency.chunk_bytes + made.residency.beside_bytes)
-        made.wait(0.05)
-    made.files.write_manifest()
-    made.close()
-    folder.close()
-    print(f"evicted {len(observer.gone)}\nmost {most}\ndone", flush=True)
 
 
 # -- a rolling map that is right because it is slow: one dictionary, one voxel after the other, no chunks
@@ -219,7 +124,3 @@ class SlowOccupancy:
     def insert(self, points: Iterable[Iterable[float]], pose: list[list[float]]) -> None:
         """Take a scan in."""
         self.add(*self.marks(points, pose))
-
-
-if __name__ == "__main__":
-    main()

@@ -49,6 +49,14 @@ def held(live: LiveMap, scope: str = "all", area: shmmap.Box | None = None) -> d
     return found
 
 
+def map_scans(live: LiveMap, scans: Iterable[Scan], name: str = "front") -> None:
+    """Map scans under a name, until all are applied."""
+    with live.mapper(name, FILTER) as mapper:
+        for points, pose in scans:
+            mapper.add(points, pose)
+        mapper.wait_applied()
+
+
 def mapped_around(live: LiveMap, here: ChunkKey) -> list[ChunkInfo]:
     """Return the chunks in memory that touch this one, itself among them; 27 once all have been loaded."""
     return [one for one in live.chunks() if one.key.distance(here) <= 1 and one.state != "loading"]

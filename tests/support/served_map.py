@@ -32,12 +32,15 @@ class Served:
         Directory of its shared memory.
     answers : dict
         By ticket; each asks under a number of its own, and the ticket is the same.
+    ended : bool
+        Whether this run is over.
     """
 
     def __init__(self, shm: Path, disk: Path, budget_bytes: int = 10**9, **limits: Any) -> None:
         self.now_s = 0.0
         self.shm = shm
         self.answers: dict[int, Any] = {}
+        self.ended = False
         self._files = 0
         self._folder = Folder(disk)
         self.marks = MarksDirectory(str(shm / "marks"))
@@ -47,7 +50,12 @@ class Served:
             settings, files, memory, Limits(budget_bytes, **limits), self.marks, self._answer
         )
         self.live = self.map.live
-        self.map.adopt(0.0)
+        try:
+            self.map.adopt(0.0)
+        except OSError:
+            self.live.close()
+            self._folder.close()
+            raise
 
     def _answer(self, ticket: int, reply: Any) -> None:
         assert ticket not in self.answers, "nothing is answered twice"
@@ -94,6 +102,9 @@ class Served:
 
     def end(self, *, keep: bool = False) -> None:
         """End this run; with ``keep`` what is in memory is left to the next one."""
+        if self.ended:
+            return
+        self.ended = True
         if not keep:
             self.until(lambda: self.map.is_saved, save_all=True)
         self.map.end(keep=keep)

@@ -166,11 +166,6 @@ def _quoted(text: str) -> str:
     return json.dumps(text, ensure_ascii=False)
 
 
-def _is_version_2(name: str) -> bool:
-    """Return whether a parameter is one of version 2."""
-    return name in _VERSION_2 or name.startswith(_GROUPS)
-
-
 def _version_2_advice(names: Iterable[str]) -> str:
     """Return a hint with the replacements of names of version 2."""
     said = []
@@ -291,7 +286,7 @@ def _check_names(entries: Mapping[str, Entry]) -> None:
     strange = [name for name in entries if name not in _KNOWN]
     if not strange:
         return
-    foreign = [name for name in strange if _is_version_2(name)]
+    foreign = [name for name in strange if name in _VERSION_2 or name.startswith(_GROUPS)]
     if foreign:
         name, origin = foreign[0], entries[foreign[0]].origin
         same = f", which version 1 calls {_VERSION_2[name]}" if _VERSION_2.get(name) else ""

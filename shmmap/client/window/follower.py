@@ -41,17 +41,8 @@ _FIRST_PAUSE_S: Final = 0.005  # between a call's requests for cells that do not
 _STALLED_S: Final = 0.5  # a call gives up on cells that do not fit after this long without progress
 
 
-class WindowFollower:
-    """Keeps a window current in a thread of its own.
-
-    All inputs reach the thread through one queue: new poses, memory to unmap, loss of the connection, the
-    end. Its only output is the attribute `state`, which it replaces.  Callers wait for that in queues, not by
-    a lock that a signal handler's exception could leave locked.
-
-    Parameters
-    ----------
-    owner
-        The object that stops the thread; see `shmmap.client.connection_watch`.
+class _Follower:
+    """State, latest pose and last error of a window, for both kinds of followers.
 
     Attributes
     ----------
@@ -63,6 +54,41 @@ class WindowFollower:
         `time.monotonic` of the first failure after the last success.
     """
 
+    def __init__(self, refresher: WindowRefresher, update_distance: float, refresh_interval_s: float) -> None:
+        self._refresher = refresher
+        self._update_distance = update_distance
+        self._refresh_interval_s = refresh_interval_s
+        self._pose: Intent | None = None
+        self.state = EMPTY
+        self.error: ShmmapError | None = None
+        self.stale_since: float | None = None
+
+    def answers(self, state: WindowState) -> bool:
+        """Return whether a state answers the latest pose."""
+        pose = self._pose
+        return pose is not None and not moved(state, pose, self._update_distance)
+
+    def _note(self, error: ShmmapError | None) -> None:
+        if error is None:
+            self.stale_since = None
+        elif self.stale_since is None:
+            self.stale_since = time.monotonic()
+        self.error = error
+
+
+class WindowFollower(_Follower):
+    """Keeps a window current in a thread of its own.
+
+    All inputs reach the thread through one queue: new poses, memory to unmap, loss of the connection, the
+    end. Its only output is the attribute `state`, which it replaces.  Callers wait for that in queues, not by
+    a lock that a signal handler's exception could leave locked.
+
+    Parameters
+    ----------
+    owner
+        The object that stops the thread; see `shmmap.client.connection_watch`.
+    """
+
     def __init__(
         self,
         refresher: WindowRefresher,
@@ -72,13 +98,10 @@ class WindowFollower:
         update_distance: float,
         refresh_interval_s: float,
     ) -> None:
+        super().__init__(refresher, update_distance, refresh_interval_s)
         self.owner = weakref.ref(owner)
-        self._refresher = refresher
         self._session = session
-        self._update_distance = update_distance
-        self._refresh_interval_s = refresh_interval_s
         self._mailbox: SimpleQueue[Owned | None] = SimpleQueue()
-        self._pose: Intent | None = None
         self._called = False
         self._stopping = False
         self._pause_s = 0.0
@@ -87,9 +110,6 @@ class WindowFollower:
         self._over: SimpleQueue[None] = SimpleQueue()
         self._ended = False
         self._pid = os.getpid()
-        self.state = EMPTY
-        self.error: ShmmapError | None = None
-        self.stale_since: float | None = None
         session.attacher.unmap_in(self._mailbox)
         session.notify_when_lost(self._mailbox)
         self._thread = 0
@@ -104,11 +124,6 @@ class WindowFollower:
     def _elsewhere(self) -> bool:
         """Whether this is a forked child, where the thread does not exist."""
         return os.getpid() != self._pid
-
-    def answers(self, state: WindowState) -> bool:
-        """Return whether a state answers the latest pose."""
-        pose = self._pose
-        return pose is not None and not moved(state, pose, self._update_distance)
 
     def move(self, pose: Intent, wait_s: float | None) -> WindowState:
         """Set a new pose and return a state: the current one at once, or one for this pose within ``wait_s``.
@@ -239,11 +254,7 @@ class WindowFollower:
 
     def _publish(self, state: WindowState, error: ShmmapError | None) -> None:
         self.state = state  # before the error: a reader without an error sees the matching state
-        if error is None:
-            self.stale_since = None
-        elif self.stale_since is None:
-            self.stale_since = time.monotonic()
-        self.error = error
+        self._note(error)
         for waiter in tuple(self._waiters):
             queue = waiter()
             if queue is None:
@@ -252,24 +263,10 @@ class WindowFollower:
                 queue.put(None)
 
 
-class BlockingFollower:
+class BlockingFollower(_Follower):
     """Keep a window current in the calling thread; same interface as `WindowFollower`."""
 
-    def __init__(
-        self, refresher: WindowRefresher, *, update_distance: float, refresh_interval_s: float
-    ) -> None:
-        self._refresher = refresher
-        self._update_distance = update_distance
-        self._refresh_interval_s = refresh_interval_s
-        self._pose: Intent | None = None
-        self._asked_s = 0.0
-        self.state = EMPTY
-        self.error: ShmmapError | None = None
-        self.stale_since: float | None = None
-
-    def answers(self, state: WindowState) -> bool:
-        """Return whether a state answers the latest pose."""
-        return self._pose is not None and not moved(state, self._pose, self._update_distance)
+    _asked_s = 0.0  # of the last request
 
     def move(self, pose: Intent, wait_s: float | None) -> WindowState:
         """Set a new pose; send requests until nothing is missing, no more cells arrive, or time is up.
@@ -283,9 +280,7 @@ class BlockingFollower:
         try:
             self._refresh(pose, _BLOCKING_WAIT_S if wait_s is None else wait_s)
         except ShmmapError as error:
-            self.error = error
-            if self.stale_since is None:
-                self.stale_since = time.monotonic()
+            self._note(error)
             raise
         return self.state
 
@@ -312,7 +307,7 @@ class BlockingFollower:
         while True:
             after, progress = self._refresher.refresh(self.state, pose, request_wait_s)
             self.state = after
-            self.error = self.stale_since = None
+            self._note(None)
             self._asked_s = now_s = time.monotonic()
             if after.settled or now_s >= deadline_s:
                 return

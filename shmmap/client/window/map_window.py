@@ -132,9 +132,7 @@ class MapWindow:
                     refresh_interval_s=refresh_interval,
                 )
             else:
-                self._follower = BlockingFollower(
-                    self._refresher, update_distance=update_distance, refresh_interval_s=refresh_interval
-                )
+                self._follower = BlockingFollower(self._refresher, update_distance, refresh_interval)
         except BaseException:
             if self._owns_client:
                 self._client.close()

@@ -144,8 +144,8 @@ class ChunkMemory:
         A directory on a tmpfs without huge pages, with which each chunk would take 2 MiB.
     prefix
         Prefix of the chunks' names, see `live_prefix`.
-    mode, gid
-        Permissions of the chunks' files; a group of -1 is the process's own.
+    gid
+        Group that may read the chunks' files; -1: no group.
 
     Attributes
     ----------
@@ -153,11 +153,11 @@ class ChunkMemory:
         Names of files that look like chunks but belong to another user; they are ignored.
     """
 
-    def __init__(self, path: str, prefix: str, *, mode: int = 0o600, gid: int = -1) -> None:
+    def __init__(self, path: str, prefix: str, gid: int = -1) -> None:
         self._fd = os.open(path, os.O_DIRECTORY | os.O_RDONLY | os.O_CLOEXEC)
         self.path = path
         self.prefix = prefix
-        self._mode, self._gid = mode, gid
+        self._gid = gid
         self.foreign: set[str] = set()
 
     def close(self) -> None:
@@ -176,7 +176,7 @@ class ChunkMemory:
         """Give a file the permissions of the chunks' files."""
         if self._gid >= 0:
             os.fchown(fd, -1, self._gid)
-        os.fchmod(fd, self._mode)
+        os.fchmod(fd, 0o640 if self._gid >= 0 else 0o600)
 
     def record(self, name: str, nbytes: int) -> mmap.mmap:
         """Map a file that outlives this process; create it filled with zeros if it does not exist.

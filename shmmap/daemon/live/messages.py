@@ -6,7 +6,7 @@ One packet of a SEQPACKET socket pair is one message.  Both ends are always the 
 
 from __future__ import annotations
 
-from functools import cache
+from collections.abc import Callable
 from typing import Final, TypeAlias
 
 import msgspec
@@ -125,6 +125,8 @@ MAX_PER_SESSION: Final = 64
 """Most requests of one session that are forwarded and not yet answered."""
 
 encode: Final = msgspec.msgpack.Encoder().encode
+decode_to_live: Final[Callable[[bytes | memoryview], ToLive]] = msgspec.msgpack.Decoder(ToLive).decode
+decode_from_live: Final[Callable[[bytes | memoryview], FromLive]] = msgspec.msgpack.Decoder(FromLive).decode
 
 
 def not_served(one: LiveSettings, budget_bytes: int, problem: str) -> LiveMapRow:
@@ -148,23 +150,3 @@ def not_served(one: LiveSettings, budget_bytes: int, problem: str) -> LiveMapRow
         budget_bytes=budget_bytes,
         problem=problem,
     )
-
-
-@cache
-def _to_live() -> msgspec.msgpack.Decoder[ToLive]:
-    return msgspec.msgpack.Decoder(ToLive)
-
-
-@cache
-def _from_live() -> msgspec.msgpack.Decoder[FromLive]:
-    return msgspec.msgpack.Decoder(FromLive)
-
-
-def decode_to_live(data: bytes | memoryview) -> ToLive:
-    """Decode a message from the daemon."""
-    return _to_live().decode(data)
-
-
-def decode_from_live(data: bytes | memoryview) -> FromLive:
-    """Decode a message from the worker."""
-    return _from_live().decode(data)

@@ -35,6 +35,7 @@ def words(tmp_path: Path) -> list[str]:
         (["--params", "nowhere.yaml"], 66, "there is no file nowhere.yaml"),
         (["--picture", "nowhere/map.svg"], 73, "cannot write nowhere/map.svg"),
         (["--poses", "nowhere.txt"], 66, "nowhere.txt"),
+        (["--scans", "tcp://127.0.0.1:9", "--resume"], 2, "--resume is for a directory"),
     ],
 )
 def test_refused_before_any_daemon_is_asked(

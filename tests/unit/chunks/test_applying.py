@@ -16,24 +16,7 @@ from shmmap.chunks.occupancy import Occupancy, ScanFilter, log_odds, probability
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.errors import ConfigError, SegmentCorrupt
 from tests.support.chunk_memory import ChunkMemory
-from tests.support.live_drive import SlowOccupancy
-
-FILTER = ScanFilter(0.2, 9.0, -5.0, 5.0)
-
-
-def drive(scans: int, *, seed: int = 1) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Scans with poses along a path that crosses chunks, comes back, and jumps."""
-    rng = np.random.default_rng(seed)
-    found = []
-    for number in range(scans):
-        pose = np.eye(4)
-        yaw = 0.3 * number
-        pose[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
-        pose[:3, 3] = [6.0 * math.sin(0.7 * number), -3.0 * number % 11.0, 0.1 * number]
-        if number % 5 == 4:
-            pose[:3, 3] -= 200.0
-        found.append((rng.normal(0.0, 4.0, (120, 3)), pose))
-    return found
+from tests.support.live_drive import FILTER, SlowOccupancy, drive
 
 
 def one_word(key: ChunkKey, hits: dict[int, int], misses: dict[int, int]) -> Marks:

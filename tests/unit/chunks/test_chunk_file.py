@@ -24,7 +24,7 @@ from shmmap.chunks.marking import Marker
 from shmmap.chunks.occupancy import ScanFilter
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.errors import ConfigError, MapDataError
-from tests.support.chunk_memory import MAP_ID, ChunkMemory
+from tests.support.chunk_memory import ChunkMemory
 
 GOLDEN = (
     "53484d434846494c0100000004030201"  # SHMCHFIL, 1.0, byte order
@@ -185,4 +185,3 @@ def test_codecs() -> None:
     assert usual_codec() == "zstd"
     with pytest.raises(ConfigError, match="raw, zstd, zlib"):
         encode_chunk(small_chunk(), "lz4")
-    assert small_chunk().identity.map_id == MAP_ID

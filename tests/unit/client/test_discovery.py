@@ -176,10 +176,11 @@ def test_a_socket_of_another_kind_is_a_protocol_mismatch(place: Path) -> None:
         connect(place / "s.sock")
 
 
+Answer = Callable[[list[bytes]], list[bytes]]
+
+
 @contextmanager
-def zmq_peer(
-    path: Path, kind: int, answer: Callable[[list[bytes]], list[bytes]] | None = None
-) -> Iterator[None]:
+def zmq_peer(path: Path, kind: int, answer: Answer | None = None) -> Iterator[None]:
     """Run a ZeroMQ program that is no shmmap daemon."""
     with zmq.Context() as context, context.socket(kind) as peer, context.socket(zmq.PAIR) as stop:
         peer.linger = 0
@@ -209,21 +210,18 @@ def zmq_peer(
                 thread.join()
 
 
-def test_a_zeromq_program_that_never_answers(place: Path) -> None:
-    with zmq_peer(place / "s.sock", zmq.DEALER), pytest.raises(NoAnswer, match="no welcome"):
-        connect(place / "s.sock")
-
-
-def test_a_zeromq_program_that_echoes(place: Path) -> None:
-    with zmq_peer(place / "s.sock", zmq.ROUTER, lambda frames: frames), pytest.raises(ProtocolMismatch):
-        connect(place / "s.sock")
-
-
-def test_a_zeromq_socket_of_another_pattern(place: Path) -> None:
-    with (
-        zmq_peer(place / "s.sock", zmq.SUB),
-        pytest.raises(ProtocolMismatch, match="no shmmap daemon"),
-    ):
+@pytest.mark.parametrize(
+    ("kind", "answer", "error", "said"),
+    [
+        (zmq.DEALER, None, NoAnswer, "no welcome"),
+        (zmq.ROUTER, lambda frames: frames, ProtocolMismatch, None),
+        (zmq.SUB, None, ProtocolMismatch, "no shmmap daemon"),
+    ],
+)
+def test_a_zeromq_program_that_is_no_daemon(
+    place: Path, kind: int, answer: Answer | None, error: type[Exception], said: str | None
+) -> None:
+    with zmq_peer(place / "s.sock", kind, answer), pytest.raises(error, match=said):
         connect(place / "s.sock")
 
 

@@ -162,9 +162,8 @@ def test_a_scan_into_a_live_map(tmp_path: Path) -> None:
     ours, theirs = channel()
     with tempfile.TemporaryDirectory(dir="/dev/shm") as shm, ours, theirs:
         ours.setblocking(False)
-        worker = _Worker(theirs)
         settings = LiveSettings("lidar", str(tmp_path / "lidar"), resolution=RESOLUTION)
-        worker.begin(live.Begin("walk", (settings,), shm, f"{shm}/marks", 1 << 24, -1, -1))
+        worker = _Worker(theirs, live.Begin("walk", (settings,), shm, f"{shm}/marks", 1 << 24, -1, -1))
         worker.run_turn()
 
         def answer(message: messages.LiveRequest) -> Any:

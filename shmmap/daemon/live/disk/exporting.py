@@ -120,46 +120,21 @@ def export(
         lattice,
         "none" if kind == "map" else translate,  # dividing translates, and records the offset
     )
-    if kind == "map":
-        return _export_map(stored, path, keys, voxels, frame, translate, cell_size, force)
-    with writing_errors(path):
-        os.makedirs(os.path.dirname(path), exist_ok=True)
-        count, chunks = _write_cloud(stored, path, kind, keys, voxels, frame, replace=force)
-    return _exported(stored, path, kind, count, chunks, 0, frame.origin, _row(frame))
-
-
-def _export_map(
-    stored: StoredMap,
-    path: str,
-    keys: list[ChunkKey],
-    voxels: Voxels,
-    frame: Frame,
-    translate: Translation,
-    cell_size: float,
-    force: bool,
-) -> ExportedVoxels:
     parent, name = os.path.split(path)
     with writing_errors(path):
         os.makedirs(parent, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{name}.voxels-", dir=parent) as scratch:
-            cloud = os.path.join(scratch, f"{os.path.basename(stored.path) or 'live'}.pcd")
-            count, chunks = _write_cloud(stored, cloud, "pcd", keys, voxels, frame, replace=False)
-            settings = DivideSettings(cell_size=cell_size, translate=translate, force=force)
-            made = divide([cloud], path, settings)
-    row = np.dtype([(field, dtype) for field, dtype in made.fields])
-    return _exported(stored, path, "map", count, chunks, made.cells, made.origin, row)
-
-
-def _exported(
-    stored: StoredMap,
-    path: str,
-    kind: Format,
-    count: int,
-    chunks: int,
-    cells: int,
-    origin: tuple[float, float, float],
-    row: np.dtype[np.void],
-) -> ExportedVoxels:
+        if kind == "map":
+            with tempfile.TemporaryDirectory(prefix=f".{name}.voxels-", dir=parent) as scratch:
+                cloud = os.path.join(scratch, f"{os.path.basename(stored.path) or 'live'}.pcd")
+                count, chunks = _write_cloud(stored, cloud, "pcd", keys, voxels, frame, replace=False)
+                settings = DivideSettings(cell_size=cell_size, translate=translate, force=force)
+                made = divide([cloud], path, settings)
+            cells, origin, fields = made.cells, made.origin, made.fields
+        else:
+            count, chunks = _write_cloud(stored, path, kind, keys, voxels, frame, replace=force)
+            cells, origin = 0, frame.origin
+            row = _row(frame)
+            fields = [(column, row[column].str) for column in row.names or ()]
     return ExportedVoxels(
         path=path,
         format=kind,
@@ -169,7 +144,7 @@ def _exported(
         resolution=stored.settings.resolution,
         frame_id=stored.settings.frame_id,
         origin=origin,
-        fields=[(name, row[name].str) for name in row.names or ()],
+        fields=fields,
         quarantined=stored.names.quarantined,
     )
 

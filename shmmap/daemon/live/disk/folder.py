@@ -15,15 +15,13 @@ import os
 import secrets
 import stat
 from itertools import count
-from typing import Final, Protocol
+from typing import Final
 
 from shmmap.errors import InstanceBusy
 
 __all__ = [
     "DAMAGED",
     "INTERIM",
-    "Files",
-    "FilesToRead",
     "Folder",
     "FolderToRead",
     "quarantine",
@@ -43,77 +41,36 @@ _libc: Final = ctypes.CDLL(None, use_errno=True)
 _RENAME_EXCHANGE: Final = 2
 
 
-class FilesToRead(Protocol):
-    """Files in one directory, by name."""
-
-    def names(self) -> list[str]:
-        """Return all names."""
-
-    def size(self, name: str) -> int:
-        """Return the length of a file, bytes."""
-
-    def read(self, name: str, most: int = MAX_BYTES) -> bytes:
-        """Return the first ``most`` bytes of a file; raise OSError if it is no regular file."""
-
-
-class Files(FilesToRead, Protocol):
-    """Files in one directory, by name, for reading and writing."""
-
-    def write(self, name: str, data: bytes) -> None:
-        """Create a file."""
-
-    def overwrite(self, name: str, data: bytes) -> None:
-        """Overwrite an unneeded file; after a failure it has a mixture of both contents."""
-
-    def sync(self, name: str) -> None:
-        """Flush a file's content to the disk."""
-
-    def exchange(self, one: str, other: str) -> None:
-        """Exchange the names of two files atomically; raise OSError if the file system cannot."""
-
-    def rename(self, old: str, new: str) -> None:
-        """Rename a file, replacing any file that has the new name."""
-
-    def remove(self, name: str) -> None:
-        """Remove a file."""
-
-    def sync_names(self) -> None:
-        """Flush all names to the disk."""
-
-    def moved(self) -> str:
-        """Return what happened to the directory if it is no longer at its path; else an empty string."""
-
-
-def write_beside(files: Files, name: str, data: bytes) -> str:
+def write_beside(folder: Folder, name: str, data: bytes) -> str:
     """Write a file for this name under an interim name; return the interim name."""
     interim = f".{name}.{secrets.token_hex(4)}{INTERIM}"
     try:
-        files.write(interim, data)
+        folder.write(interim, data)
     except OSError:
         with contextlib.suppress(OSError):
-            files.remove(interim)
+            folder.remove(interim)
         raise
     return interim
 
 
-def replace_file(files: Files, name: str, data: bytes) -> None:
+def replace_file(folder: Folder, name: str, data: bytes) -> None:
     """Write a file to disk, replacing any file of its name; `sync_names` makes the name durable."""
-    interim = write_beside(files, name, data)
+    interim = write_beside(folder, name, data)
     try:
-        files.sync(interim)
-        files.rename(interim, name)
+        folder.sync(interim)
+        folder.rename(interim, name)
     except OSError:
         with contextlib.suppress(OSError):
-            files.remove(interim)
+            folder.remove(interim)
         raise
 
 
-def quarantine(files: Files, name: str) -> str:
+def quarantine(folder: Folder, name: str) -> str:
     """Rename a damaged file to a quarantine name, durably; return that name."""
-    taken = set(files.names())
+    taken = set(folder.names())
     other = next(one for number in count(1) if (one := f"{name}{DAMAGED}{number}") not in taken)
-    files.rename(name, other)
-    files.sync_names()
+    folder.rename(name, other)
+    folder.sync_names()
     return other
 
 

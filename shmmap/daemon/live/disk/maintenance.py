@@ -10,7 +10,7 @@ from typing import Literal
 import msgspec
 
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.disk.folder import Files, FilesToRead, Folder, FolderToRead, quarantine
+from shmmap.daemon.live.disk.folder import Folder, FolderToRead, quarantine
 from shmmap.daemon.live.disk.map_record import (
     CHUNK,
     MANIFEST,
@@ -103,7 +103,7 @@ class CheckedMap(msgspec.Struct):
         return sum(getattr(row, what) for row in self.rows.values())
 
 
-def check(files: FilesToRead, path: str) -> CheckedMap:
+def check(files: FolderToRead, path: str) -> CheckedMap:
     """Read every chunk completely, without changing anything; other processes may be using the files.
 
     Raises
@@ -152,7 +152,7 @@ def check(files: FilesToRead, path: str) -> CheckedMap:
     )
 
 
-def _is_spare(files: FilesToRead, name: str, rows: dict[ChunkKey, Row]) -> bool:
+def _is_spare(files: FolderToRead, name: str, rows: dict[ChunkKey, Row]) -> bool:
     """Return whether a file is only a spare: its chunk's own file is as new.  Raise OSError."""
     try:
         header = read_header(files, name)
@@ -169,7 +169,7 @@ def _row_or_error(stored: StoredMap, key: ChunkKey) -> Row | MapDataError:
     return Row.of(header)
 
 
-def _listed(files: FilesToRead) -> dict[ChunkKey, Row] | Literal["absent", "unreadable"]:
+def _listed(files: FolderToRead) -> dict[ChunkKey, Row] | Literal["absent", "unreadable"]:
     """Return the chunks that the manifest lists."""
     try:
         return read_manifest(files)[0]
@@ -188,7 +188,7 @@ def _missing(listed: dict[ChunkKey, Row], rows: dict[ChunkKey, Row], known: set[
     ]
 
 
-def repair(files: Files, found: CheckedMap) -> None:
+def repair(files: Folder, found: CheckedMap) -> None:
     """Quarantine files that are damaged or cannot be read, and list the good ones in a new manifest.
 
     ``found`` is updated: all quarantined files are then in ``damaged``, with their new names.  No other

@@ -23,7 +23,7 @@ import msgspec
 
 from shmmap.chunks.chunk_file import FILE_HEADER_BYTES, ChunkFileHeader, check_file, read_file_header
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.disk.folder import Files, quarantine, replace_file
+from shmmap.daemon.live.disk.folder import Folder, quarantine, replace_file
 from shmmap.daemon.live.disk.map_record import (
     CHUNK,
     MANIFEST,
@@ -82,7 +82,7 @@ class MapFiles:
         A file cannot be read or written.
     """
 
-    def __init__(self, files: Files, settings: MapSettings) -> None:
+    def __init__(self, files: Folder, settings: MapSettings) -> None:
         self.files = files
         self.rows: dict[ChunkKey, Row] = {}
         self.damaged: dict[str, str] = {}
@@ -136,17 +136,15 @@ class MapFiles:
         """Add a mapper with a new number, which is on disk when this returns."""
         mapper = Mapper(self._map.next_mapper, uid, name)
         self._map.next_mapper += 1
-        before, self._map.mappers = self._map.mappers, [*self._map.mappers, mapper]
-        try:
-            self._write_map()
-        except OSError:
-            self._map.mappers = before
-            raise
+        self._write_mappers([*self.mappers, mapper])
         return mapper
 
     def forget_mapper(self, mapper: Mapper) -> None:
         """Forget a mapper; its number is not used again."""
-        before, self._map.mappers = self._map.mappers, [one for one in self._map.mappers if one is not mapper]
+        self._write_mappers([one for one in self.mappers if one is not mapper])
+
+    def _write_mappers(self, mappers: list[Mapper]) -> None:
+        before, self._map.mappers = self._map.mappers, mappers
         try:
             self._write_map()
         except OSError:

@@ -19,7 +19,7 @@ from shmmap.chunks.layout import MAPPERS, MAX_FRAME_BYTES, ChunkIdentity
 from shmmap.chunks.layout import MAX_BYTES as MAX_CHUNK_BYTES
 from shmmap.chunks.occupancy import Occupancy
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.disk.folder import DAMAGED, INTERIM, MAX_BYTES, Files, FilesToRead, replace_file
+from shmmap.daemon.live.disk.folder import DAMAGED, INTERIM, MAX_BYTES, Folder, FolderToRead, replace_file
 from shmmap.errors import BadRequest, ConfigError, MapDataError
 
 __all__ = [
@@ -210,7 +210,7 @@ class FileNames(NamedTuple):
         return [*first, *sorted(others), *last]
 
 
-def _whole(files: FilesToRead, name: str, most: int) -> bytes:
+def _whole(files: FolderToRead, name: str, most: int) -> bytes:
     """Return a whole file of at most ``most`` bytes; raise as `read_map`."""
     data = files.read(name, most + 1)
     if len(data) > most:
@@ -218,12 +218,12 @@ def _whole(files: FilesToRead, name: str, most: int) -> bytes:
     return data
 
 
-def read_chunk(files: FilesToRead, name: str) -> bytes:
+def read_chunk(files: FolderToRead, name: str) -> bytes:
     """Return the whole file of a chunk, unchecked; raise as `read_map`."""
     return _whole(files, name, _MAX_CHUNK_FILE_BYTES)
 
 
-def read_header(files: FilesToRead, name: str, path: str = "") -> ChunkFileHeader:
+def read_header(files: FolderToRead, name: str, path: str = "") -> ChunkFileHeader:
     """Return the header of a chunk's file, which errors call ``path``; raise as `read_map`."""
     return read_file_header(files.read(name, FILE_HEADER_BYTES), path or name)
 
@@ -241,7 +241,7 @@ def _decoded(data: bytes, decoder: msgspec.json.Decoder[_T], name: str) -> _T:
         raise MapDataError(f"it is damaged: {reason}", path=name) from error
 
 
-def read_map(files: FilesToRead) -> MapRecord:
+def read_map(files: FolderToRead) -> MapRecord:
     """Read ``map.json``.
 
     Raises
@@ -269,7 +269,7 @@ def read_map(files: FilesToRead) -> MapRecord:
     return found
 
 
-def read_manifest(files: FilesToRead) -> tuple[dict[ChunkKey, Row], dict[int, int]]:
+def read_manifest(files: FolderToRead) -> tuple[dict[ChunkKey, Row], dict[int, int]]:
     """Return the chunks in the manifest, and for each mapper the last scan up to which all are durable.
 
     Raises
@@ -288,7 +288,7 @@ def read_manifest(files: FilesToRead) -> tuple[dict[ChunkKey, Row], dict[int, in
         raise MapDataError(f"it is damaged: {error.message}", path=MANIFEST) from error
 
 
-def write_rows(files: Files, rows: Mapping[ChunkKey, Row], applied: dict[int, int]) -> None:
+def write_rows(files: Folder, rows: Mapping[ChunkKey, Row], applied: dict[int, int]) -> None:
     """Write the manifest: these chunks, and all scans of mappers up to these, are durable."""
     listed = Manifest(MAP_FORMAT, {key.text: row for key, row in rows.items()}, applied)
     replace_file(files, MANIFEST, msgspec.json.encode(listed))

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from shmmap.chunks.chunk_file import ChunkFileHeader, decode_chunk, read_file_header
 from shmmap.chunks.layout import ChunkView
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.disk.folder import FilesToRead, Folder, FolderToRead
+from shmmap.daemon.live.disk.folder import Folder, FolderToRead
 from shmmap.daemon.live.disk.map_record import CHUNK, MAP_FILE, FileNames, read_chunk, read_header, read_map
 from shmmap.errors import InstanceBusy, MapDataError, MapMissing
 
@@ -41,7 +41,7 @@ class StoredMap:
         ``map.json`` is damaged or invalid.
     """
 
-    def __init__(self, files: FilesToRead, path: str) -> None:
+    def __init__(self, files: FolderToRead, path: str) -> None:
         self.files = files
         self.path = path
         try:

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.disk.folder import Files, write_beside
+from shmmap.daemon.live.disk.folder import Folder, write_beside
 from shmmap.daemon.live.disk.map_record import CHUNK
 from shmmap.failpoints import step
 
@@ -49,7 +49,7 @@ class UnflushedFiles:
         Memory of the files in this process.
     """
 
-    def __init__(self, files: Files) -> None:
+    def __init__(self, files: Folder) -> None:
         self._files = files
         self.nbytes = 0
         self._written: dict[ChunkKey, _Written] = {}

@@ -28,42 +28,23 @@ class KeyIndex:
     """
 
     def __init__(self, keys: Iterable[ChunkKey] = ()) -> None:
-        self._xs: list[int] = []
-        self._columns: dict[int, list[ChunkKey]] = {}  # by x, each sorted
-        self._keys: set[ChunkKey] = set(keys)
-        for key in sorted(self._keys):
-            if key.x not in self._columns:
-                self._xs.append(key.x)
-                self._columns[key.x] = []
-            self._columns[key.x].append(key)
+        self._keys = set(keys)
+        self._sorted = sorted(self._keys)
 
     def __len__(self) -> int:
         return len(self._keys)
 
-    def __contains__(self, key: ChunkKey) -> bool:
-        return key in self._keys
-
     def add(self, key: ChunkKey) -> None:
         """Add a key, unless it is in the set."""
-        if key in self._keys:
-            return
-        self._keys.add(key)
-        column = self._columns.get(key.x)
-        if column is None:
-            column = self._columns[key.x] = []
-            insort(self._xs, key.x)
-        insort(column, key)
+        if key not in self._keys:
+            self._keys.add(key)
+            insort(self._sorted, key)
 
     def discard(self, key: ChunkKey) -> None:
         """Remove a key, if it is in the set."""
-        if key not in self._keys:
-            return
-        self._keys.remove(key)
-        column = self._columns[key.x]
-        del column[bisect_left(column, key)]
-        if not column:
-            del self._columns[key.x]
-            del self._xs[bisect_left(self._xs, key.x)]
+        if key in self._keys:
+            self._keys.remove(key)
+            del self._sorted[bisect_left(self._sorted, key)]
 
     def part(
         self, after: ChunkKey | None, within: KeyRange, most: int
@@ -75,7 +56,7 @@ class KeyIndex:
         after
             Keys up to this one are left out; None: begin with the first key.
         most
-            Most keys and columns to examine, whether in the range or not.
+            Most keys to examine, whether in the range or not.
 
         Returns
         -------
@@ -85,31 +66,22 @@ class KeyIndex:
             Pass it as ``after`` to continue; None at the end.
         """
         low, high = within
+        keys = self._sorted
         found: list[ChunkKey] = []
-        at = bisect_left(self._xs, low.x if after is None else max(low.x, after.x))
-        for number in range(at, len(self._xs)):
-            x = self._xs[number]
-            if x > high.x:
-                break
-            column = self._columns[x]
-            first = bisect_left(column, (x, low.y, low.z))
-            if after is not None and after.x == x:
-                first = max(first, bisect_right(column, after))
-                if first == len(column):
-                    continue
-            for place in range(first, len(column)):
-                key = column[place]
-                if key.y > high.y:
-                    break
+        at = bisect_left(keys, low)
+        if after is not None:
+            at = max(at, bisect_right(keys, after))
+        for _ in range(most):
+            if at == len(keys) or keys[at].x > high.x:
+                return found, None
+            key = keys[at]
+            if low.y <= key.y <= high.y:
                 if low.z <= key.z <= high.z:
                     found.append(key)
-                most -= 1
-                if most <= 0:
-                    return found, key
-            most -= 1
-            if most <= 0:
-                return found, ChunkKey(x, _FAR, _FAR)
-        return found, None
+                at += 1
+            else:  # to the range's first place with this x, or with the next one
+                at = bisect_left(keys, (key.x + (key.y > high.y), low.y, low.z), at)
+        return found, keys[at - 1]
 
 
 def merged_part(

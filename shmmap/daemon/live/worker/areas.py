@@ -18,18 +18,28 @@ __all__ = ["check_area", "inside", "key_range", "touches"]
 
 def check_area(area: LiveArea) -> None:
     """Raise `BadRequest` if an area is invalid."""
+    low, high = _ends(area)
     if isinstance(area, SphereMessage):
         numbers = (area.x, area.y, area.z, area.radius)
         good = all(abs(number) < FURTHEST_M for number in numbers) and area.radius >= 0.0
     else:
-        low, high = (area.min_x, area.min_y), (area.max_x, area.max_y)
         if (area.z_min is None) != (area.z_max is None):
             raise BadRequest("area: a z range has two ends")
-        if area.z_min is not None and area.z_max is not None:
-            low, high = (*low, area.z_min), (*high, area.z_max)  # type: ignore[assignment]
-        good = bool(np.isfinite([*low, *high]).all()) and all(a <= b for a, b in zip(low, high, strict=True))
-    if not good:
+        some = slice(2 if area.z_min is None else 3)
+        good = all(map(math.isfinite, [*low[some], *high[some]]))
+    if not good or not all(a <= b for a, b in zip(low, high, strict=True)):
         raise BadRequest("area: it is not finite, or nothing can lie in it")
+
+
+def _ends(area: LiveArea) -> tuple[list[float], list[float]]:
+    """Return the lowest and the highest x, y, z of an area, metres; infinity where it has no end."""
+    if isinstance(area, SphereMessage):
+        middle = (area.x, area.y, area.z)
+        return [at - area.radius for at in middle], [at + area.radius for at in middle]
+    return (
+        [area.min_x, area.min_y, -math.inf if area.z_min is None else area.z_min],
+        [area.max_x, area.max_y, math.inf if area.z_max is None else area.z_max],
+    )
 
 
 def touches(area: LiveArea | None, key: ChunkKey, resolution: float) -> bool:
@@ -41,10 +51,12 @@ def touches(area: LiveArea | None, key: ChunkKey, resolution: float) -> bool:
         axes = (area.x, low_x, high_x), (area.y, low_y, high_y), (area.z, low_z, high_z)
         gaps = (max(low - value, 0.0, value - high) for value, low, high in axes)
         return sum(gap * gap for gap in gaps) <= area.radius * area.radius
-    flat = low_x <= area.max_x and high_x >= area.min_x and low_y <= area.max_y and high_y >= area.min_y
-    if area.z_min is None or area.z_max is None:
-        return flat
-    return flat and low_z <= area.z_max and high_z >= area.z_min
+    low, high = _ends(area)
+    return (
+        (low_x <= high[0] and high_x >= low[0])
+        and (low_y <= high[1] and high_y >= low[1])
+        and (low_z <= high[2] and high_z >= low[2])
+    )
 
 
 def inside(area: LiveArea | None, centers: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -56,10 +68,9 @@ def inside(area: LiveArea | None, centers: NDArray[np.float64]) -> NDArray[np.bo
         away = centers - np.array([area.x, area.y, area.z])
         found = (away * away).sum(axis=1) <= area.radius * area.radius
         return found
-    x, y, z = centers.T
-    found = (x >= area.min_x) & (x <= area.max_x) & (y >= area.min_y) & (y <= area.max_y)
-    if area.z_min is not None and area.z_max is not None:
-        found &= (z >= area.z_min) & (z <= area.z_max)
+    found = np.ones(len(centers), np.bool_)
+    for axis, low, high in zip(centers.T, *_ends(area), strict=True):
+        found &= (axis >= low) & (axis <= high)
     return found
 
 
@@ -67,12 +78,7 @@ def key_range(area: LiveArea | None, resolution: float) -> KeyRange:
     """Return a range of keys that includes every chunk that touches an area, despite rounding."""
     if area is None:
         return EVERYWHERE
-    if isinstance(area, SphereMessage):
-        middle, reach = (area.x, area.y, area.z), area.radius
-        low, high = [at - reach for at in middle], [at + reach for at in middle]
-    else:
-        low = [area.min_x, area.min_y, -math.inf if area.z_min is None else area.z_min]
-        high = [area.max_x, area.max_y, math.inf if area.z_max is None else area.z_max]
+    low, high = _ends(area)
     side, furthest = CHUNK_SIDE * resolution, FURTHEST_INDEX // CHUNK_SIDE + 1
 
     def key(place: list[float], beyond: int) -> ChunkKey:

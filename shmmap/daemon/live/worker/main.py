@@ -47,17 +47,21 @@ LEAST_CHUNKS: Final = 64
 
 
 class _Worker:
-    """Serves the maps of the daemon's first message, each as soon as its files are read."""
+    """Serves the maps of the daemon's first message, each as soon as its files are read.
 
-    def __init__(self, channel: socket.socket) -> None:
+    A map that fails is retried.
+    """
+
+    def __init__(self, channel: socket.socket, wanted: messages.Begin) -> None:
         self._channel = channel
         self._buffer = packet_buffer()
         self._done = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         self._poller = select.poll()
         for readable in (channel.fileno(), self._done):
             self._poller.register(readable, select.POLLIN)
-        self._wanted: messages.Begin | None = None
-        self._opening: dict[str, OpeningMap] = {}
+        self._wanted = wanted
+        self._budget_bytes = wanted.budget_bytes // max(1, len(wanted.maps))  # of each map
+        self._opening = {one.name: OpeningMap(one, self._budget_bytes, self._wake) for one in wanted.maps}
         self._maps: dict[str, ServedMap] = {}
         self._closing: dict[str, contextlib.ExitStack] = {}
         self._ending: messages.End | None = None
@@ -67,16 +71,6 @@ class _Worker:
         self._marks: MarksDirectory | None = None
 
     # --- the start ------------------------------------------------------------------------------
-
-    def begin(self, wanted: messages.Begin) -> None:
-        """Begin to load the maps; a map that fails is retried."""
-        self._wanted = wanted
-        for one in wanted.maps:
-            self._opening[one.name] = OpeningMap(one, self._budget_bytes(wanted), self._wake)
-
-    @staticmethod
-    def _budget_bytes(wanted: messages.Begin) -> int:
-        return wanted.budget_bytes // max(1, len(wanted.maps))
 
     def _open_some(self, now_s: float) -> None:
         """Serve each map whose files are read; report once when all are served, or why they are not."""
@@ -91,11 +85,8 @@ class _Worker:
         if not self._begun and all(one.problem for one in self._opening.values()):
             self._begun = True
             self._send_status(now_s)  # before READY, so that the maps' state is available by then
-            self._send(messages.Begun(len(self._maps), self._chunks, *self._refusal()))
-
-    @property
-    def _chunks(self) -> int:
-        return sum(len(one.live.chunks) for one in self._maps.values())
+            chunks = sum(len(one.live.chunks) for one in self._maps.values())
+            self._send(messages.Begun(len(self._maps), chunks, *self._refusal()))
 
     def _refusal(self) -> tuple[str, str, str]:
         """Return why no map can be served with these settings; empty if the problem may be temporary."""
@@ -108,15 +99,13 @@ class _Worker:
     def _served(self, settings: LiveSettings, folder: Folder, files: MapFiles) -> ServedMap:
         """Set up a map in memory, including chunks that a previous process left there."""
         wanted = self._wanted
-        assert wanted is not None  # noqa: S101
-        mode = 0o640 if wanted.gid >= 0 else 0o600
         prefix = live_prefix(wanted.instance, settings.name)
-        limits = _limits(settings, self._budget_bytes(wanted), len(wanted.maps))
+        limits = _limits(settings, self._budget_bytes, len(wanted.maps))
         with contextlib.ExitStack() as closing:
             closing.callback(folder.close)
             if self._marks is None:
                 self._marks = MarksDirectory(wanted.marks_dir, wanted.marks_gid)
-            memory = ChunkMemory(wanted.shm_dir, prefix, mode=mode, gid=wanted.gid)
+            memory = ChunkMemory(wanted.shm_dir, prefix, wanted.gid)
             closing.callback(memory.close)
             served = ServedMap(
                 settings, files, memory, limits, self._marks, self._answer, self._wake, usual_codec()
@@ -245,9 +234,8 @@ class _Worker:
 
     def _rows(self) -> tuple[LiveMapRow, ...]:
         """Return the state of all maps, in the order of the settings."""
-        wanted = self._wanted.maps if self._wanted is not None else ()
         known: dict[str, ServedMap | OpeningMap] = {**self._opening, **self._maps}
-        return tuple(known[one.name].status() for one in wanted)
+        return tuple(known[one.name].status() for one in self._wanted.maps)
 
     # --- the end --------------------------------------------------------------------------------
 
@@ -296,8 +284,7 @@ def main(arguments: list[str]) -> int:
         wanted = messages.decode_to_live(data)
         if not isinstance(wanted, messages.Begin):
             return 1
-        worker = _Worker(channel)
-        worker.begin(wanted)
+        worker = _Worker(channel, wanted)
         gc.collect()
         gc.freeze()
         worker.run()

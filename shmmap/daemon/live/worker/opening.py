@@ -100,21 +100,15 @@ class OpeningMap:
         """Read the files, in a thread that may never return."""
         outcome: tuple[Folder, MapFiles] | Exception
         try:
-            outcome = open_files(self.settings)
+            outcome = _open_files(self.settings)
         except Exception as error:  # noqa: BLE001  a damaged file must not end other maps
             outcome = error
         self._outcome.append(outcome)
         self._wake()
 
 
-def open_files(settings: LiveSettings) -> tuple[Folder, MapFiles]:
-    """Open a map's directory and read it; a new run of the map begins.
-
-    Raises
-    ------
-    ShmmapError, OSError
-        It cannot be opened.
-    """
+def _open_files(settings: LiveSettings) -> tuple[Folder, MapFiles]:
+    """Open a map's directory and read it; a new run of the map begins."""
     folder = Folder(settings.path)
     try:
         files = MapFiles(folder, MapSettings(settings.resolution, settings.occupancy, settings.frame_id))

@@ -163,11 +163,6 @@ class Readers:
             return now_s
         return min([self.lists.next_expiry_s, *(due_s for due_s, _ in self._later)])
 
-    @property
-    def are_waiting(self) -> bool:
-        """Whether a request is in progress."""
-        return bool(self._ready or self._later or self._in_thread)
-
     def on_disconnect(self, session: int) -> None:
         """Drop the requests and lists of a session that has ended."""
         works = [*self._ready.pop(session, ()), *(work for work, _ in self._in_thread.get(session, ()))]

@@ -16,7 +16,6 @@ import mmap
 import os
 import secrets
 import time
-from collections import deque
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, field
 from functools import partial
@@ -69,6 +68,7 @@ It returns the reply.
 
 @dataclass(eq=False, slots=True)
 class _List:
+    session: int
     name: str
     nbytes: int
     until_s: float
@@ -85,25 +85,25 @@ class VoxelLists:
     """
 
     live: PagedMap
-    _lists: dict[int, deque[_List]] = field(default_factory=dict)
+    _lists: list[_List] = field(default_factory=list)
     _making: int = 0
-    _asked: dict[int, int] = field(default_factory=dict)
+    _asked: list[int] = field(default_factory=list)
     is_closed: bool = False
 
     @property
     def nbytes(self) -> int:
         """Memory of all lists."""
-        return sum(one.nbytes for lists in self._lists.values() for one in lists)
+        return sum(one.nbytes for one in self._lists)
 
     @property
     def asked_bytes(self) -> int:
         """The smallest amount of memory that a list waits for; 0 if none waits."""
-        return min(self._asked.values(), default=0)
+        return min(self._asked, default=0)
 
     @property
     def next_expiry_s(self) -> float:
         """Time at which the next list expires; infinity for never."""
-        return min((one.until_s for lists in self._lists.values() for one in lists), default=math.inf)
+        return min((one.until_s for one in self._lists), default=math.inf)
 
     def collect(
         self, message: LiveVoxels, keys: Iterator[list[ChunkKey]], session: int, change: int
@@ -187,8 +187,8 @@ class VoxelLists:
 
     def _room(self, nbytes: int) -> Steps:
         """Wait until chunks are evicted for a list."""
-        number = secrets.randbits(62)
         until_s = time.monotonic() + ROOM_S
+        self._asked.append(nbytes)
         try:
             while nbytes and not self.live.residency.fits(nbytes):
                 if time.monotonic() >= until_s:
@@ -196,20 +196,18 @@ class VoxelLists:
                         f"a list of {nbytes} bytes has no room: chunks that cannot be saved take all of it",
                         hint="see what `shmmap live ls` says, or raise --live-budget",
                     )
-                self._asked[number] = nbytes
                 yield Later(ASK_AGAIN_S)
         finally:
-            self._asked.pop(number, None)
+            self._asked.remove(nbytes)
 
     def _write(
         self, parts: list[_Part], nbytes: int, session: int
     ) -> Generator[Callable[[], Any] | Later | None, Any, str]:
         memory = self.live.memory
-        one = _List(f"{memory.prefix}{NAME}{secrets.token_hex(8)}", _pages(nbytes), math.inf)
+        one = _List(session, f"{memory.prefix}{NAME}{secrets.token_hex(8)}", _pages(nbytes), math.inf)
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW
         fd = os.open(memory.path + one.name, flags, 0o600)
-        lists = self._lists.setdefault(session, deque())
-        lists.append(one)
+        self._lists.append(one)
         self.live.residency.beside_bytes += one.nbytes
         try:
             for column in (0, 1):
@@ -222,50 +220,42 @@ class VoxelLists:
                             yield None
             memory.give_access(fd)
         except BaseException:
-            if one in lists:
-                lists.remove(one)
-                self._remove(one)
+            self._remove([other for other in self._lists if other is one])
             raise
         finally:
             os.close(fd)
         one.until_s = time.monotonic() + KEPT_S
-        if len(lists) > LISTS_PER_SESSION:
-            oldest = min(lists, key=lambda other: other.until_s)
-            lists.remove(oldest)
-            self._remove(oldest)
+        kept = sorted(
+            (other for other in self._lists if other.session == session), key=lambda other: other.until_s
+        )
+        self._remove(kept[:-LISTS_PER_SESSION])
         return one.name
 
     def release(self, session: int, name: str) -> None:
         """Remove a list of this session."""
-        lists = self._lists.get(session, deque())
-        for one in [one for one in lists if one.name == name]:
-            lists.remove(one)
-            self._remove(one)
+        self._remove([one for one in self._lists if (one.session, one.name) == (session, name)])
 
     def expire(self, now_s: float) -> None:
         """Remove expired lists."""
-        for lists in self._lists.values():
-            for one in [one for one in lists if one.until_s <= now_s]:
-                lists.remove(one)
-                self._remove(one)
+        self._remove([one for one in self._lists if one.until_s <= now_s])
 
     def on_disconnect(self, session: int) -> None:
         """Remove the lists of a session that has ended."""
-        for one in self._lists.pop(session, ()):
-            self._remove(one)
+        self._remove([one for one in self._lists if one.session == session])
 
     def remove_all(self) -> None:
         """Remove all lists, including those of previous runs."""
-        for session in list(self._lists):
-            self.on_disconnect(session)
+        self._remove(list(self._lists))
         start = self.live.memory.prefix.lstrip("/") + NAME
         for name in os.listdir(self.live.memory.path):
             if name.startswith(start):
                 self._free("/" + name)
 
-    def _remove(self, one: _List) -> None:
-        self.live.residency.beside_bytes -= one.nbytes
-        self._free(one.name)
+    def _remove(self, lists: list[_List]) -> None:
+        for one in lists:
+            self._lists.remove(one)
+            self.live.residency.beside_bytes -= one.nbytes
+            self._free(one.name)
 
     def _free(self, name: str) -> None:
         """Free a file's memory, even while readers use it, and remove its name."""

@@ -51,15 +51,13 @@ def shm() -> Iterator[Path]:
 
 @pytest.fixture
 def serve(shm: Path, tmp_path: Path) -> Iterator[Callable[..., Served]]:
-    """Begin runs of one map, ``serve(budget_bytes, linger_s=..., ...)``; `Served.end` ends them."""
+    """Begin runs of one map, ``serve(budget_bytes, linger_s=..., ...)``; the last one is ended at the end."""
     begun: list[Served] = []
 
     def factory(budget_bytes: int = 10**9, **limits: Any) -> Served:
-        for previous in begun:
-            previous.live.close()
         begun.append(Served(shm, tmp_path / "map", budget_bytes, **limits))
         return begun[-1]
 
     yield factory
     for one in begun:
-        one.live.close()
+        one.end()

@@ -7,7 +7,6 @@ import errno
 import os
 import resource
 import signal
-import stat
 import subprocess
 import sys
 import tempfile
@@ -124,15 +123,6 @@ def test_a_writer_that_died_while_it_gave_a_chunk_up_leaves_nothing_to_adopt(
     assert memory.is_given_up(NAME)
 
 
-def test_who_may_read_it(directory: Path) -> None:
-    memory = ChunkMemory(str(directory), PREFIX, mode=0o640, gid=os.getgid())
-    memory.create(new_header(IDENTITY)).close()
-    status = (directory / NAME[1:]).stat()
-    assert (stat.S_IMODE(status.st_mode), status.st_gid) == (0o640, os.getgid())
-    memory.remove(NAME)
-    memory.close()
-
-
 def test_where_there_is_no_memory_nothing_changes(memory: ChunkMemory, directory: Path) -> None:
     """A full file system, or a limit: an error, no signal, and the chunk is as it was."""
     chunk = memory.create(new_header(IDENTITY))
@@ -163,19 +153,6 @@ def test_where_nothing_more_can_be_mapped_no_name_stays(
         with pytest.raises(OSError, match="Cannot allocate memory"):
             memory.create(new_header(IDENTITY))
     assert list(directory.iterdir()) == []
-
-
-@pytest.mark.root
-def test_another_user_s_files_are_not_taken_over(memory: ChunkMemory, directory: Path) -> None:
-    memory.create(new_header(IDENTITY)).close()
-    theirs = [directory / f"{PREFIX[1:]}0_0_0.3"]
-    for path in theirs:
-        path.write_bytes(new_header(replace(IDENTITY, key=ChunkKey(0, 0, 0), generation=3)))
-        os.chown(path, MEMBER, -1)
-    assert [name for name, _, _ in memory.names()] == [NAME]
-    assert memory.foreign == {path.name for path in theirs}
-    for path in theirs:
-        path.unlink()
 
 
 @pytest.mark.parametrize(

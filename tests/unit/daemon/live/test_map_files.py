@@ -66,7 +66,6 @@ def test_a_map_is_made_and_found_again(tmp_path: Path) -> None:
     assert [version_of(again, key) for key in KEYS] == [3, 1, 0]
     assert not again.missing
     assert not again.damaged
-    folder.close()
 
 
 @pytest.mark.parametrize(
@@ -117,7 +116,6 @@ def test_a_damaged_file_is_quarantined_and_never_overwritten(tmp_path: Path) -> 
     assert again.quarantine(KEYS[0], "its body is damaged") == "0_0_0.chunk.damaged.2"
     assert (tmp_path / "0_0_0.chunk.damaged.1").read_bytes() == b"CORRUPTED DATA"
     assert again.load(KEYS[0]) is None
-    folder.close()
 
 
 def test_a_file_that_did_not_get_its_name_is_taken_if_it_is_newer() -> None:
@@ -171,7 +169,6 @@ def test_files_are_written_over_again(tmp_path: Path) -> None:
     assert [version_of(made, key) for key in KEYS] == [7, 7, 7]
     made.remove_spare()
     assert sorted(folder.names()) == sorted([*(key.text + ".chunk" for key in KEYS), "map.json"])
-    folder.close()
 
 
 def test_who_reads_a_file_that_is_written_over_reads_the_one_in_its_place(
@@ -195,7 +192,6 @@ def test_who_reads_a_file_that_is_written_over_reads_the_one_in_its_place(
     assert folder.read("other") == b"c" * 5000
     folder.overwrite("other", b"d" * 10)
     assert folder.read("other") == b"d" * 10
-    folder.close()
 
 
 @pytest.mark.parametrize("what", ["sync", "rename", "sync_names"])
@@ -486,7 +482,6 @@ def test_a_file_of_a_tebibyte_is_not_read(tmp_path: Path, name: str) -> None:
     else:
         again = MapFiles(folder, SETTINGS)
         assert list(again.damaged) == ([] if name.endswith(".tmp") else [f"{name}.damaged.1"])
-    folder.close()
 
 
 @pytest.mark.parametrize("name", ["map.json", "manifest.json", "0_0_0.chunk", ".chunk.ab.tmp"])
@@ -509,4 +504,3 @@ def test_what_is_no_regular_file_keeps_the_map_closed(tmp_path: Path, name: str,
     if (tmp_path / "kept").exists():
         (tmp_path / "kept").rename(path)
     assert list(MapFiles(folder, SETTINGS).rows) == [KEYS[0]]
-    folder.close()

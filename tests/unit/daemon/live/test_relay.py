@@ -296,26 +296,6 @@ def test_a_worker_that_does_not_end(world: World) -> None:
     assert world.relay.unsaved == {"lidar": 5}
 
 
-@pytest.mark.parametrize("started", [False, True], ids=["none", "starting"])
-def test_chunks_of_a_worker_that_ended_are_saved_by_the_next(world: World, started: bool) -> None:
-    world.die()
-    if started:
-        world.relay.start()
-
-    def wait(_seconds: float) -> None:
-        received = world.received()
-        if isinstance(received[0], messages.Begin):
-            world.workers[-1].send(messages.encode(messages.Begun(1, 5)))
-        else:
-            assert received == [messages.End(False)]
-            world.workers[-1].send(messages.encode(messages.Ended(())))
-
-    world.wait = wait
-    world.relay.close(keep=False)
-    assert len(world.workers) == 2
-    assert world.relay.unsaved == {}
-
-
 @pytest.mark.parametrize("dies", [False, True], ids=["hangs", "dies"])
 def test_memory_stays_where_no_worker_starts_to_save_it(
     world: World, caplog: pytest.LogCaptureFixture, dies: bool

@@ -17,7 +17,7 @@ from shmmap.daemon.live.disk.folder import Folder
 from shmmap.daemon.live.disk.map_record import MapSettings
 from shmmap.daemon.live.disk.stored_map import StoredMap, opened_folder_to_read
 from shmmap.dividing.frame import Translation
-from shmmap.errors import BadRequest, MapDataError
+from shmmap.errors import MapDataError
 from shmmap.formats.cloud import read_cloud
 from tests.support.divided_map import read_pcd
 from tests.support.live_drive import RESOLUTION, Voxel
@@ -147,18 +147,6 @@ def test_voxels_that_are_neither(directory: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", FORMATS)
-def test_what_is_there_stays(directory: Path, kind: Format) -> None:
-    stored_drive(directory, 2)
-    assert exported(directory, kind) is not None
-    before = contents(place(directory, kind).parent)
-    with pytest.raises(BadRequest, match=r"exists|is a map already"):
-        exported(directory, kind, "free")
-    assert contents(place(directory, kind).parent) == before
-    assert exported(directory, kind, "free", force=True) is not None
-    assert contents(place(directory, kind).parent) != before
-
-
-@pytest.mark.parametrize("kind", FORMATS)
 def test_a_damaged_file_ends_it(directory: Path, kind: Format) -> None:
     stored_drive(directory, 2)
     path = sorted(directory.glob("*.chunk"))[-1]
@@ -175,13 +163,6 @@ def test_a_damaged_file_ends_it(directory: Path, kind: Format) -> None:
     made = exported(directory, kind, "both")
     assert made is not None
     assert made.quarantined == [f"{path.name}.damaged.1"]
-
-
-@pytest.mark.parametrize("kind", FORMATS)
-def test_nothing_to_export(directory: Path, kind: Format) -> None:
-    stored_drive(directory, 0)
-    assert exported(directory, kind, "both") is None
-    assert not place(directory, kind).parent.exists()
 
 
 def test_one_chunk_at_a_time(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -46,21 +46,25 @@ def test_a_file_is_taken(marks: MarksDirectory, path: Path) -> None:
     assert not (path / MINE).exists(), "its memory is free for chunks"
 
 
+OTHER_NAMES = [
+    "1b.7", "a.7", "01a.7x", "1a.", "1a", "1A.7", "01a.7", "../1a.7", "1a.7/x", "1a.-1", "1a.7\n", "", ".",
+]  # fmt: skip
+
+
 @pytest.mark.parametrize(
-    "name",
-    ["1b.7", "a.7", "01a.7x", "1a.", "1a", "1A.7", "01a.7", "../1a.7", "1a.7/x", "1a.-1", "1a.7\n", "", "."],
+    ("name", "nbytes", "said"),
+    [
+        *((name, len(CONTENT), "not a name that this session may use") for name in OTHER_NAMES),
+        *((MINE, nbytes, "bytes") for nbytes in (0, -1, MAX_MARKS_BYTES + 1, 1 << 60)),
+    ],
 )
-def test_names_that_are_not_the_session_s(marks: MarksDirectory, path: Path, name: str) -> None:
-    (path / "1b.7").write_bytes(CONTENT)
-    with pytest.raises(BadRequest, match="not a name that this session may use"):
-        take(marks, name)
-
-
-@pytest.mark.parametrize("nbytes", [0, -1, MAX_MARKS_BYTES + 1, 1 << 60])
-def test_sizes_that_cannot_be(marks: MarksDirectory, path: Path, nbytes: int) -> None:
-    (path / MINE).write_bytes(CONTENT)
-    with pytest.raises(BadRequest, match="bytes"):
-        take(marks, nbytes=nbytes)
+def test_names_and_sizes_that_cannot_be(
+    marks: MarksDirectory, path: Path, name: str, nbytes: int, said: str
+) -> None:
+    for there in ("1b.7", MINE):
+        (path / there).write_bytes(CONTENT)
+    with pytest.raises(BadRequest, match=said):
+        take(marks, name, nbytes)
 
 
 def link(path: Path) -> None:

@@ -16,8 +16,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from shmmap.chunks.layout import OUT_OF_SERVICE
 from shmmap.chunks.marks import Marks
 from shmmap.daemon.live import messages as worker_messages
+from shmmap.daemon.live.chunk_memory import ChunkMemory
 from shmmap.daemon.live.messages import MAX_PER_SESSION
 from shmmap.daemon.live.worker import served_map
 from shmmap.daemon.live.worker.main import MESSAGES_PER_TURN, _Worker
@@ -29,6 +31,7 @@ from shmmap.protocol.messages import ErrorReply
 from tests.support.chunk_memory import ChunkMemory as Unbounded
 from tests.support.daemon_process import Deadline
 from tests.support.live_drive import RESOLUTION, Voxel, marked
+from tests.support.odd_files import failing
 from tests.support.served_map import Served
 
 Serve = Callable[..., Served]
@@ -88,7 +91,6 @@ def test_a_scan_that_is_sent_again_counts_once(serve: Serve) -> None:
     late = one.send(marks, opened.mapper, 1)
     assert one.answer(late).scan == 1
     assert one.voxels() == reference(marks)
-    one.end()
 
 
 def test_a_running_scan_is_answered_to_the_session_that_sends_it_again(
@@ -111,7 +113,6 @@ def test_a_running_scan_is_answered_to_the_session_that_sends_it_again(
     assert one.answer(second).scan == 1
     assert one.map.status().scans == 1
     assert one.voxels() == reference(marks)
-    one.end()
 
 
 def test_what_waits_when_a_session_ends_is_not_applied(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -129,7 +130,6 @@ def test_what_waits_when_a_session_ends_is_not_applied(serve: Serve, monkeypatch
     one.turn()
     assert waits not in one.answers
     assert one.voxels() == reference(first)
-    one.end()
 
 
 def test_what_waits_when_another_session_takes_the_mapper_is_refused(
@@ -150,7 +150,6 @@ def test_what_waits_when_another_session_takes_the_mapper_is_refused(
     assert isinstance(refused, ErrorReply)
     assert f"does not map as mapper {mapper}" in refused.message
     assert one.voxels() == reference(first)
-    one.end()
 
 
 def test_tickets_of_a_scan_do_not_pile_up(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -169,7 +168,6 @@ def test_tickets_of_a_scan_do_not_pile_up(serve: Serve, monkeypatch: pytest.Monk
     blocked.may.set()
     one.until(lambda: one.map.status().scans)
     assert one.voxels() == reference(marks)
-    one.end()
 
 
 def test_unexpected_marks_end_nothing(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -188,7 +186,6 @@ def test_unexpected_marks_end_nothing(serve: Serve, monkeypatch: pytest.MonkeyPa
     assert isinstance(refused, ErrorReply)
     assert refused.code == "internal"
     assert one.answer(one.send(marks, mapper, 1)).scan == 1
-    one.end()
 
 
 def test_a_chunk_whose_file_is_damaged_is_not_written_over(serve: Serve, tmp_path: Path) -> None:
@@ -211,6 +208,31 @@ def test_a_chunk_whose_file_is_damaged_is_not_written_over(serve: Serve, tmp_pat
     assert damaged in [path.read_bytes() for path in victim.parent.iterdir() if path.is_file()]
 
 
+def test_what_was_all_but_given_up_comes_back_from_disk(
+    serve: Serve, monkeypatch: pytest.MonkeyPatch, shm: Path
+) -> None:
+    """Out of service, its name still there: no reader may have it; and what cannot be opened stays."""
+    one = serve(**LATER)
+    (marks,) = marked(1)
+    one.answer(one.send(marks, one.open().mapper, 1))
+    one.until(lambda: one.map.is_saved, save_all=True)
+    key = marks.chunks[0]
+    gone = shm / one.live.chunks[key].name[1:]
+    one.live.chunks[key].view.state["state"] = OUT_OF_SERVICE
+    one.end(keep=True)
+    left = sorted(shm.glob("*_*"))
+    with monkeypatch.context() as patch:
+        patch.setattr(ChunkMemory, "open", failing(errno.EMFILE))
+        with pytest.raises(OSError, match="Too many open files"):
+            serve(**LATER)
+    assert sorted(shm.glob("*_*")) == left
+    one = serve(**LATER)
+    assert key not in one.live.chunks
+    assert not gone.exists()
+    one.answer(one.send(marks, one.open().mapper, 1))
+    assert one.voxels() == reference(marks)
+
+
 def test_scans_of_a_place_that_is_known_take_no_memory(serve: Serve) -> None:
     """Each is gone when it is in its chunks and on the disk."""
     one = serve()
@@ -230,7 +252,6 @@ def test_scans_of_a_place_that_is_known_take_no_memory(serve: Serve) -> None:
     more = after(30) - before
     tracemalloc.stop()
     assert more < 10 * (marks.bits.nbytes + marks.words.nbytes)
-    one.end()
 
 
 def test_who_may_not_map(serve: Serve) -> None:
@@ -245,7 +266,6 @@ def test_who_may_not_map(serve: Serve) -> None:
     one.ask(lambda n: messages.LiveOpen(n, "lidar"), maps=False)
     with pytest.raises(BadRequest, match="frame 'map', not 'odom'"):
         one.ask(lambda n: messages.LiveOpen(n, "lidar", "", "odom"))
-    one.end()
 
 
 @pytest.mark.parametrize("place", [(float("nan"), 0.0, 0.0), (0.0, float("inf"), 0.0), (0.0, 0.0, 1e12)])
@@ -253,7 +273,6 @@ def test_places_that_are_nowhere(serve: Serve, place: tuple[float, float, float]
     one = serve()
     with pytest.raises(BadRequest, match="not finite, or too far away"):
         one.ask(lambda n: messages.LiveMove(n, "lidar", place))
-    one.end()
 
 
 # --- durable ------------------------------------------------------------------------------------
@@ -272,7 +291,6 @@ def test_what_a_previous_run_did_not_save_is_not_durable(serve: Serve) -> None:
     assert one.answer(one.send(NOTHING, opened.mapper, first)).durable == 0
     one.until(lambda: one.map.is_saved, save_all=True)
     assert one.answer(one.send(NOTHING, opened.mapper, first + 1)).durable >= first
-    one.end()
 
 
 def test_saved_means_that_what_was_given_up_is_on_the_disk_too(
@@ -293,7 +311,6 @@ def test_saved_means_that_what_was_given_up_is_on_the_disk_too(
     blocked.may.set()
     assert one.answer(ticket).scan == 1
     assert one.map.status().durable == 1
-    one.end()
 
 
 def test_a_save_is_answered_when_all_that_came_before_is_durable(serve: Serve) -> None:
@@ -305,7 +322,6 @@ def test_a_save_is_answered_when_all_that_came_before_is_durable(serve: Serve) -
     reply = one.answer(one.ask(lambda n: messages.LiveSave(n, "lidar")))
     assert (reply.scan, reply.files) == (2, len(set(first.chunks) | set(second.chunks)))
     one.until(lambda: one.map.is_saved)
-    one.end()
 
 
 # --- a disk that is full ------------------------------------------------------------------------
@@ -334,7 +350,6 @@ def test_a_disk_that_is_full_stops_no_mapper(serve: Serve, monkeypatch: pytest.M
         assert {key for marks in scans for key in marks.chunks} <= set(one.live.chunks)
     one.until(lambda: one.map.is_saved, save_all=True)
     assert one.map.status().problem == ""
-    one.end()
 
 
 def test_a_new_mapper_needs_the_disk(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -347,7 +362,6 @@ def test_a_new_mapper_needs_the_disk(serve: Serve, monkeypatch: pytest.MonkeyPat
             True,
         )
     assert one.open().mapper == 2, "a number is never given twice, whatever came of it"
-    one.end()
 
 
 def test_a_directory_that_cannot_be_flushed_is_tried_again_later(
@@ -370,7 +384,6 @@ def test_a_directory_that_cannot_be_flushed_is_tried_again_later(
         assert ticket not in one.answers
     assert one.answer(ticket).scan == 1
     assert one.map.status().problem == ""
-    one.end()
 
 
 def test_the_list_of_files_is_written_once_a_minute(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -386,7 +399,6 @@ def test_the_list_of_files_is_written_once_a_minute(serve: Serve, monkeypatch: p
         one.turn()
     assert len(times_s) > 1
     assert min(b - a for a, b in pairwise(times_s)) >= served_map.MANIFEST_S
-    one.end()
 
 
 # --- sleeping -----------------------------------------------------------------------------------
@@ -402,7 +414,6 @@ def test_while_a_chunk_is_loaded_nothing_turns(serve: Serve, monkeypatch: pytest
         assert one.map.next_turn_s(one.now_s) >= one.now_s + 0.05
     blocked.may.set()
     one.until(lambda: one.map.status().scans)
-    one.end()
 
 
 def test_while_files_are_written_nothing_turns(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -420,7 +431,6 @@ def test_while_files_are_written_nothing_turns(serve: Serve, monkeypatch: pytest
     assert blocked.calls == 1
     assert one.map.next_turn_s(one.now_s) >= one.now_s + 0.05
     blocked.may.set()
-    one.end()
 
 
 def test_answers_wait_for_a_daemon_that_is_busy() -> None:
@@ -429,7 +439,7 @@ def test_answers_wait_for_a_daemon_that_is_busy() -> None:
     buffer = packet_buffer()
     with ours, theirs:
         theirs.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 0)  # the least there is
-        worker = _Worker(theirs)
+        worker = _Worker(theirs, worker_messages.Begin("test", (), "", "", 1 << 22, -1, -1))
         for ticket in range(MESSAGES_PER_TURN):
             message = messages.LiveList(ticket) if ticket % 2 else messages.LiveOpen(ticket, "x" * 60)
             ours.send(worker_messages.encode(worker_messages.Ask(ticket, 1, 0, True, encode(message))))
