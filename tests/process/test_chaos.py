@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import DaemonProcess, Deadline
+from tests.support.daemon_process import DaemonProcess, until
 from tests.support.divided_map import DividedMap, random_points
 from tests.support.mapping_process import MappingProcess
 from tests.support.raw_client import RawClient, circle
@@ -112,9 +112,7 @@ class Life:
 
     def check_books(self) -> None:
         """The daemon's sums are those of the files."""
-        waiting = Deadline()
-        while waiting(not self._books_agree()):
-            pass
+        until(lambda: self._books_agree())
 
     def _books_agree(self) -> bool:
         counters = self.client.ask("stats")[4]

@@ -18,7 +18,7 @@ import pytest
 from shmmap import Box
 from shmmap import connect as connect_client
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import ROOT, DaemonProcess, Deadline
+from tests.support.daemon_process import ROOT, DaemonProcess, until
 from tests.support.divided_map import DividedMap
 from tests.support.mapping_process import MappingProcess
 from tests.support.raw_client import RawClient, circle
@@ -115,9 +115,7 @@ def test_a_client_in_a_container(
         freed = client.ask("evict")
         assert (freed[2], freed[3]) == (0, len(expected))
         os.kill(pid, signal.SIGKILL)
-        waiting = Deadline()
-        while waiting(bool(one.segments()) or len(client.ask("stats")[5]) > 1):
-            pass
+        until(lambda: not one.segments() and len(client.ask("stats")[5]) <= 1)
 
 
 def test_a_container_that_lacks_the_segments_gets_an_error(

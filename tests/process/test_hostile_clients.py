@@ -19,7 +19,7 @@ import zmq
 
 from tests.process.conftest import DaemonFactory
 from tests.support.accounts import GROUP, MEMBER, python_for_others
-from tests.support.daemon_process import ROOT, DaemonProcess, Deadline
+from tests.support.daemon_process import ROOT, DaemonProcess, until
 from tests.support.divided_map import DividedMap
 from tests.support.message_pack import pack
 from tests.support.process_costs import descriptors, peak_bytes, resident_bytes
@@ -84,9 +84,7 @@ def test_bytes_that_are_no_zeromq(daemon: DaemonFactory, connect: Connect, divid
             other.send(rng.randbytes(rng.randrange(1, 500)))
     for _ in range(50):
         assert len(client.area(circle(0, 0, 5)).cells) == 4
-    waiting = Deadline()
-    while waiting(descriptors(one.pid) > before):
-        client.ask("stats")
+    until(lambda: descriptors(one.pid) <= before)
 
 
 def test_random_messages(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
@@ -167,19 +165,13 @@ def test_clients_that_die_are_forgotten(
     for process in dying[1:]:
         process.kill()
         process.communicate()
-    waiting = Deadline()
-    while waiting(len(client.ask("stats")[5]) > 2):
-        pass
+    until(lambda: len(client.ask("stats")[5]) <= 2)
     for _ in range(20):
         assert len(client.ask("stats")[5]) == 2  # the stopped one is not reaped
     dying[0].kill()
     dying[0].communicate()
-    waiting = Deadline()
-    while waiting(len(client.ask("stats")[5]) > 1):
-        pass
-    waiting = Deadline()
-    while waiting(descriptors(one.pid) > before):
-        client.ask("stats")
+    until(lambda: len(client.ask("stats")[5]) <= 1)
+    until(lambda: descriptors(one.pid) <= before)
 
 
 def test_sessions_come_and_go_without_a_trace(
@@ -197,16 +189,12 @@ def test_sessions_come_and_go_without_a_trace(
             client.ask("evict")
             if number % 4 == 0:
                 client.ask("reload")
-        waiting = Deadline()
-        while waiting(bool(one.segments()) or len(client.ask("stats")[5]) > 1):
-            client.ask("stats")
+        until(lambda: not one.segments() and len(client.ask("stats")[5]) <= 1)
 
     busy()
     before, loaders = descriptors(one.pid), one.children()
     busy()
-    waiting = Deadline()
-    while waiting(descriptors(one.pid) > before):
-        client.ask("stats")
+    until(lambda: descriptors(one.pid) <= before)
     assert one.children() == loaders
 
 
@@ -320,9 +308,7 @@ def test_more_connections_than_descriptors(
         serves(connect(one))
         assert f"connections ended pid={process.pid} count=" in one.log
         serves(client)
-    waiting = Deadline()
-    while waiting(descriptors(one.pid) > LIMIT // 2):
-        client.ask("stats")
+    until(lambda: descriptors(one.pid) <= LIMIT // 2)
 
 
 def test_more_sessions_than_there_may_be(
@@ -348,9 +334,7 @@ done()
         serves(client)
         serves(connect(one))
         assert "sessions already" not in one.log
-    waiting = Deadline()
-    while waiting(len(client.ask("stats")[5]) > 2):
-        pass
+    until(lambda: len(client.ask("stats")[5]) <= 2)
 
 
 def test_replies_that_are_never_read(
@@ -401,9 +385,7 @@ except OSError:
         serves(client)
         assert f"connections ended pid={process.pid} count=" in one.log
         assert "it made the daemon take too much memory" in one.log
-    waiting = Deadline()
-    while waiting(resident_bytes(one.pid) > 400 << 20):
-        client.ask("stats")
+    until(lambda: resident_bytes(one.pid) <= 400 << 20)
 
 
 def test_a_process_that_asks_too_much_at_once(

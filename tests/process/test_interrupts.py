@@ -32,7 +32,7 @@ from shmmap.client import connection_watch
 from shmmap.client.connection_watch import running, start_thread
 from shmmap.client.window import follower
 from shmmap.errors import BadRequest
-from tests.support.daemon_process import DaemonProcess, Deadline
+from tests.support.daemon_process import DaemonProcess, until
 from tests.support.divided_map import DividedMap
 
 Factory = Callable[..., DaemonProcess]
@@ -99,9 +99,7 @@ def threads() -> set[str]:
 
 def await_end_of_threads(known: set[str]) -> None:
     """Wait until there is no thread but these: one that has said that it is over still has to end."""
-    waiting = Deadline()
-    while waiting(not threads() <= known):
-        time.sleep(0.001)
+    until(lambda: threads() <= known)
 
 
 def holdings(one: DaemonProcess) -> tuple[int, int, int]:

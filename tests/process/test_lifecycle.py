@@ -20,7 +20,7 @@ import shmmap
 from shmmap.protocol.rows import CellRow
 from shmmap.statistics.reader import read_statistics
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import DaemonProcess, Deadline, wait_ended
+from tests.support.daemon_process import DaemonProcess, Deadline, first_answer, until, wait_ended
 from tests.support.divided_map import DividedMap, random_points
 from tests.support.mapping_process import MappingProcess
 from tests.support.raw_client import DaemonError, RawClient, circle
@@ -193,21 +193,18 @@ def test_what_the_statistics_have(daemon: DaemonFactory, connect: Connect, divid
     os.waitid(os.P_PID, one.pid, os.WSTOPPED | os.WNOWAIT)
     assert read_statistics(one.instance, one.shm_dir).state == "stopped"
     one.send(signal.SIGCONT)
-    waiting = Deadline()
-    while waiting(len((seen := read_statistics(one.instance, one.shm_dir)).cells) < 12):
-        client.ask("stats")  # their rows follow when clients have been answered
+    # their rows follow when clients have been answered
+    seen = first_answer(
+        lambda: read_statistics(one.instance, one.shm_dir), lambda found: len(found.cells) >= 12
+    )
     assert [cell.id for cell in seen.cells] == sorted(divided_map.in_circle(0, 0, 25))
     assert {cell.state for cell in seen.cells} == {"resident"}
     assert sum(cell.bytes for cell in seen.cells) == seen.counters["bytes_resident"] == one.segment_bytes()
     before = {cell.id: cell for cell in seen.cells}
     for _ in range(3):
         client.selected(["0_0.pcd"])
-    waiting = Deadline()
-    while waiting(read_statistics(one.instance, one.shm_dir).counters["handles_sent"] < 15):
-        client.ask("stats")
-    waiting = Deadline()
-    while waiting(_row(one, "0_0.pcd").hits < before["0_0.pcd"].hits + 3):
-        client.ask("stats")
+    until(lambda: read_statistics(one.instance, one.shm_dir).counters["handles_sent"] >= 15)
+    until(lambda: _row(one, "0_0.pcd").hits >= before["0_0.pcd"].hits + 3)
     assert _row(one, "0_0.pcd").last_use_monotonic_ns > before["0_0.pcd"].last_use_monotonic_ns
     one.kill()
     assert read_statistics(one.instance, one.shm_dir).state == "dead"

@@ -25,7 +25,7 @@ from shmmap.segment.process_limits import check_files, check_threads
 from shmmap.statistics.reader import read_statistics
 from shmmap.testing.daemon_process import without_settings
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import ROOT, DaemonProcess, Deadline
+from tests.support.daemon_process import ROOT, DaemonProcess, first_answer, until
 from tests.support.divided_map import DividedMap, make_map, random_points
 from tests.support.raw_client import RawClient, circle
 
@@ -87,9 +87,7 @@ def test_a_segment_that_the_limit_on_files_forbids(daemon: Factory, divided_map:
         assert len(client.around(-40, -40, 5, wait=60)) == 4
         for pid in (one.pid, *one.children()):
             resource.prlimit(pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
-        waiting = Deadline()
-        while waiting(bool(cells.failed)):
-            cells = client.around(0, 0, 15, wait=60)
+        cells = first_answer(lambda: client.around(0, 0, 15, wait=60), lambda found: not found.failed)
         assert len(cells) == 4
 
 
@@ -103,15 +101,11 @@ def test_statistics_that_cannot_be_written_end_no_process(
     soft, hard = resource.prlimit(one.pid, resource.RLIMIT_FSIZE)
     resource.prlimit(one.pid, resource.RLIMIT_FSIZE, (16384, hard))
     said = 'statistics not written error="File too large"'
-    waiting = Deadline()
-    while waiting(said not in one.log):
-        pass
+    until(lambda: said in one.log)
     asked = client.ask("stats")[4]["requests"]
     assert [handle.segment for handle in client.area(circle(0, 0, 5)).cells] == warm
     resource.prlimit(one.pid, resource.RLIMIT_FSIZE, (soft, hard))
-    waiting = Deadline()
-    while waiting(read_statistics(one.instance, one.shm_dir).counters["requests"] <= asked):
-        pass
+    until(lambda: read_statistics(one.instance, one.shm_dir).counters["requests"] > asked)
     assert one.log.count(said) == 1
 
 
@@ -422,9 +416,7 @@ def test_three_thousand_cells_with_a_thousand_descriptors(
             "mapped": 3000,
         }
         assert len(os.listdir(f"/proc/{one.pid}/fd")) < 64
-        waiting = Deadline()
-        while waiting(len(read_statistics(one.instance, one.shm_dir).cells) < 3000):
-            raw.ask("stats")
+        until(lambda: len(read_statistics(one.instance, one.shm_dir).cells) >= 3000)
         seen = read_statistics(one.instance, one.shm_dir)
         assert sorted(cell.id for cell in seen.cells) == sorted(made.corners)
         assert sum(cell.bytes for cell in seen.cells) == one.segment_bytes()
@@ -432,9 +424,7 @@ def test_three_thousand_cells_with_a_thousand_descriptors(
         print(file=holder.stdin, flush=True)
         assert json.loads(holder.stdout.readline()) == [0, 3000]
         one.until_segments(0, lambda: raw.ask("stats"))
-        waiting = Deadline()
-        while waiting(bool(read_statistics(one.instance, one.shm_dir).cells)):
-            raw.ask("stats")
+        until(lambda: not read_statistics(one.instance, one.shm_dir).cells)
     finally:
         holder.kill()
         holder.communicate()

@@ -15,7 +15,7 @@ import pytest
 import shmmap
 from shmmap.daemon.host.inotify import NAME_GONE, Inotify
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import Deadline
+from tests.support.daemon_process import Deadline, first_answer, until
 from tests.support.divided_map import DividedMap
 from tests.support.mapping_process import MappingProcess
 from tests.support.raw_client import RawClient, circle
@@ -36,9 +36,7 @@ def test_evicting_everything_frees_what_is_not_mapped(
         assert (evicted[2], evicted[3]) == (len(handles) - 2, 2)
         one.until_segments(2, lambda: client.ask("stats"))
         assert all(name.endswith(".zombie") for name in one.segments())
-        waiting = Deadline()
-        while waiting(client.ask("stats")[4]["zombies"] != 2):  # gauges are written a few times a second
-            pass
+        until(lambda: client.ask("stats")[4]["zombies"] == 2)
         os.kill(reader.pid, signal.SIGSTOP)
         client.ask("evict")
         os.kill(reader.pid, signal.SIGCONT)
@@ -66,15 +64,11 @@ def test_a_stopped_process_without_a_session_keeps_its_bytes_across_a_restart(
         one.start()
         client.hello()
         # while a loader compares it with its checksums, other holders are not known
-        waiting = Deadline()
-        while waiting((stats := client.ask("stats"))[6] == 0):
-            pass
+        stats = first_answer(lambda: client.ask("stats"), lambda found: found[6])
         assert (stats[6], stats[7] >= handle.bytes) == (1, True)
         client.ask("evict")
         assert len(one.segments()) == 1
-        waiting = Deadline()
-        while waiting((stats := client.ask("stats"))[6] == 0):
-            pass
+        stats = first_answer(lambda: client.ask("stats"), lambda found: found[6])
         assert (stats[6], stats[7] >= handle.bytes) == (1, True)
         os.kill(process.pid, signal.SIGCONT)
         assert process.checksums() == [expected]
@@ -113,15 +107,13 @@ def test_names_removed_behind_the_daemon_s_back(
     with MappingProcess([kept]) as reader:
         for handle in handles if at_once else handles[:1]:
             os.unlink(client.path(handle))
-        again = client.area(circle(0, 0, 25)).cells
-        waiting = Deadline()
-        while waiting(not all(Path(client.path(handle)).exists() for handle in again)):
-            again = client.area(circle(0, 0, 25)).cells
+        again = first_answer(
+            lambda: client.area(circle(0, 0, 25)).cells,
+            lambda cells: all(Path(client.path(cell)).exists() for cell in cells),
+        )
         assert again[0].segment != handles[0].segment
         assert reader.checksums() == [expected]
-    waiting = Deadline()
-    while waiting(client.ask("stats")[4]["bytes_resident"] != one.segment_bytes()):
-        pass
+    until(lambda: client.ask("stats")[4]["bytes_resident"] == one.segment_bytes())
 
 
 @pytest.mark.parametrize("source", ["locks", "sessions"])

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import Deadline
+from tests.support.daemon_process import first_answer, until
 from tests.support.divided_map import DividedMap, random_points
 from tests.support.mapping_process import MappingProcess
 from tests.support.raw_client import DaemonError, RawClient, circle
@@ -75,9 +75,7 @@ def test_the_signal(daemon: DaemonFactory, connect: Connect, divided_map: Divide
     divided_map.change("0_0.pcd", 5)
     one.send(signal.SIGHUP)
     reply = client.selected(["0_0.pcd"])
-    waiting = Deadline()
-    while waiting(reply.map_version == old.map_version):
-        reply = client.selected(["0_0.pcd"])
+    reply = first_answer(lambda: client.selected(["0_0.pcd"]), lambda one: one.map_version != old.map_version)
     assert_same_points(client, reply.cells[0], divided_map)
 
 
@@ -157,9 +155,7 @@ def test_old_versions_stay_while_a_process_maps_them(
         new = client.selected(["0_0.pcd"]).cells[0]
         assert new.segment != old.segment
         assert reader.checksums() == before
-        waiting = Deadline()
-        while waiting(not any(name.endswith(".zombie") for name in one.segments())):
-            client.ask("stats")
+        until(lambda: any(name.endswith(".zombie") for name in one.segments()))
         assert len(one.segments()) == 2
     one.until_segments(1, lambda: client.ask("stats"))
 

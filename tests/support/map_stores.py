@@ -30,7 +30,7 @@ from typing import Any, Final
 import pytest
 
 from tests.support.command_line import Verbs
-from tests.support.daemon_process import ROOT, Deadline
+from tests.support.daemon_process import ROOT, Deadline, until
 from tests.support.divided_map import make_map
 
 
@@ -280,9 +280,7 @@ class CephServer(BucketServer):
 
     def wait_for_disks(self, up: int) -> None:
         """Wait until this number of disks is up."""
-        waiting = Deadline()
-        while waiting(f" {up} up" not in self.run("ceph", "osd", "stat")):
-            pass
+        until(lambda: f" {up} up" in self.run("ceph", "osd", "stat"))
 
     def wait_for_gateway(self) -> None:
         """Wait until the gateway answers."""

@@ -13,7 +13,7 @@ from types import TracebackType
 import pytest
 
 from tests.support.booted_systemd import BootedSystemd
-from tests.support.daemon_process import Deadline
+from tests.support.daemon_process import Deadline, until
 from tests.support.divided_map import DividedMap
 from tests.systemd.conftest import MAP, RUN
 
@@ -181,9 +181,7 @@ def test_the_watchdog_ends_a_daemon_that_hangs_and_the_next_one_is_warm(fresh: B
         names = segments(fresh)
         pid = fresh.properties("shmmapd")["MainPID"]
         fresh.run("kill", f"-{int(signal.SIGSTOP)}", pid)
-        waiting = Deadline()
-        while waiting(fresh.properties("shmmapd")["MainPID"] in ("0", pid)):
-            pass
+        until(lambda: fresh.properties("shmmapd")["MainPID"] not in ("0", pid))
         fresh.run("systemctl", "start", "shmmapd")  # returns when it is ready
         assert "Watchdog timeout" in fresh.shell("journalctl --sync; journalctl --no-pager -u shmmapd")
         assert alice.held() == before
@@ -275,9 +273,7 @@ def test_live_maps_have_a_place_and_the_rights_that_they_need(fresh: BootedSyste
     """)
     done = shmmap(fresh, "status", "--json", user="alice")
     assert [row["name"] for row in json.loads(done.stdout)["live"]] == ["lidar"], done.stderr
-    waiting = Deadline()  # points are served before live maps are
-    while waiting(fresh.shell("ls -d /dev/shm/shmmap-live.default.marks || true") == ""):
-        pass
+    until(lambda: fresh.shell("ls -d /dev/shm/shmmap-live.default.marks || true") != "")
     places = "/var/lib/shmmap /var/lib/shmmap/state/default /var/lib/shmmap/state/default/live/lidar"
     assert fresh.shell(f"stat -c '%a %U:%G' {places} /dev/shm/shmmap-live.default.marks").splitlines() == [
         "755 root:root",
