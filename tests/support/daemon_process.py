@@ -32,6 +32,7 @@ __all__ = [
     "TIMEOUT_S",
     "DaemonProcess",
     "Deadline",
+    "LineProcess",
     "counters",
     "first_answer",
     "next_reload",
@@ -129,6 +130,48 @@ class DaemonProcess(daemon_process.DaemonProcess):
         waiting = Deadline()
         while waiting(len(self.segments()) > at_most):
             ask()
+
+
+class LineProcess:
+    """A program that is written lines and prints some; killed at the end of its ``with`` block."""
+
+    def __init__(self, *command: str | Path, **options: Any) -> None:
+        self.process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT, **options
+        )
+
+    def __enter__(self) -> LineProcess:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.kill()
+
+    @property
+    def pid(self) -> int:
+        """Its process id."""
+        return self.process.pid
+
+    def read(self) -> str:
+        """Wait for the next line; it may not have ended."""
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        assert line, f"it ended with {self.process.wait()}"
+        return str(line).rstrip("\n")
+
+    def write(self, line: str = "") -> None:
+        """Send a line."""
+        assert self.process.stdin is not None
+        self.process.stdin.write(line + "\n")
+        self.process.stdin.flush()
+
+    def end(self) -> None:
+        """Close its input, and wait for its end."""
+        self.process.communicate(timeout=30)
+
+    def kill(self) -> None:
+        """End it now, whatever it does, and wait for its end."""
+        self.process.kill()
+        self.process.communicate()
 
 
 # A limit for loops that ask until something has happened: a defect fails one test, not the whole run
