@@ -12,7 +12,6 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,12 +19,12 @@ import pytest
 import shmmap
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.prerequisites import access_of_segments
-from shmmap.errors import ConfigError, LimitReached
+from shmmap.errors import ConfigError
 from shmmap.segment.process_limits import check_files, check_threads
 from shmmap.statistics.reader import read_statistics
 from shmmap.testing.daemon_process import without_settings
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import ROOT, DaemonProcess, first_answer, until
+from tests.support.daemon_process import ROOT, DaemonProcess, LineProcess, first_answer, until
 from tests.support.divided_map import DividedMap, make_map, random_points
 from tests.support.raw_client import RawClient, circle
 
@@ -247,12 +246,7 @@ print(window.wait_until_current(60), tried(lambda: None if client.around(0, 0, 5
 def test_none_to_connect_again_with(daemon: Factory, divided_map: DividedMap) -> None:
     """The daemon is back, and this process may not open a socket: the error does not blame the daemon."""
     one = daemon(divided_map.root)
-    program = subprocess.Popen(
-        [
-            sys.executable,
-            "-c",
-            PROGRAM
-            + """
+    code = """
 client = shmmap.connect(endpoint, timeout=1)
 print("connected", flush=True)
 while client.disconnected_since is None:
@@ -264,24 +258,18 @@ print(tried(lambda: client.around(0, 0, 50)), flush=True)
 free_files()
 client.close()
 print(tried(lambda: None if shmmap.connect(endpoint).around(0, 0, 50).complete else "no"), flush=True)
-""",
-            one.endpoint,
-        ],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-        cwd=ROOT,
-    )
-    assert program.stdout is not None
-    assert program.stdout.readline() == "connected\n"
-    one.stop()
-    assert program.stdout.readline() == "lost\n"
-    one.start()
-    rest, _ = program.communicate("\n", timeout=120)
-    refusal, after = rest.splitlines()
-    assert refusal.startswith("LimitReached: a connection to the daemon needs 1 more descriptors, 0 are left")
-    assert after == "works"
-    assert program.returncode == 0
+"""
+    with LineProcess(sys.executable, "-c", PROGRAM + code, one.endpoint) as program:
+        assert program.read() == "connected"
+        one.stop()
+        assert program.read() == "lost"
+        one.start()
+        program.write()
+        assert program.read().startswith(
+            "LimitReached: a connection to the daemon needs 1 more descriptors, 0 are left"
+        )
+        assert program.read() == "works"
+        assert program.process.wait(120) == 0
 
 
 @pytest.mark.parametrize("left", range(5))
@@ -340,11 +328,6 @@ def test_checking_leaves_nothing() -> None:
     assert set(os.listdir("/proc/self/task")) <= threads, "those of earlier tests may be ending"
 
 
-def test_the_error_is_one_of_ours() -> None:
-    assert shmmap.LimitReached is LimitReached
-    assert (LimitReached.code, LimitReached.exit_code) == ("limit_reached", 71)
-
-
 # --- what a client costs its process: descriptors, modules, memory -----------------------------------
 
 
@@ -376,20 +359,6 @@ sys.stdin.readline()
 """
 
 
-def run(program: str, *arguments: str) -> dict[str, Any]:
-    done = subprocess.run(
-        [sys.executable, "-c", program, *arguments],
-        capture_output=True,
-        text=True,
-        timeout=400,
-        check=False,
-        cwd=ROOT,
-    )
-    assert (done.returncode, done.stderr) == (0, "")
-    said: dict[str, Any] = json.loads(done.stdout)
-    return said
-
-
 def test_three_thousand_cells_with_a_thousand_descriptors(
     daemon: Factory, connect: Connect, tmp_path: Path
 ) -> None:
@@ -397,17 +366,8 @@ def test_three_thousand_cells_with_a_thousand_descriptors(
     made = make_map(tmp_path / "map", columns=60, rows=50, points=3)
     one = daemon(made.root, "--session-quota", "1")
     raw = connect(one)
-    holder = subprocess.Popen(
-        [sys.executable, "-c", MANY, one.endpoint],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-        cwd=ROOT,
-    )
-    assert holder.stdin is not None
-    assert holder.stdout is not None
-    try:
-        assert json.loads(holder.stdout.readline()) == {
+    with LineProcess(sys.executable, "-c", MANY, one.endpoint) as holder:
+        assert json.loads(holder.read()) == {
             "complete": True,
             "cells": 3000,
             "points": 9000,
@@ -421,13 +381,10 @@ def test_three_thousand_cells_with_a_thousand_descriptors(
         assert sorted(cell.id for cell in seen.cells) == sorted(made.corners)
         assert sum(cell.bytes for cell in seen.cells) == one.segment_bytes()
         assert raw.ask("evict")[2:4] == [0, 3000]
-        print(file=holder.stdin, flush=True)
-        assert json.loads(holder.stdout.readline()) == [0, 3000]
+        holder.write()
+        assert json.loads(holder.read()) == [0, 3000]
         one.until_segments(0, lambda: raw.ask("stats"))
         until(lambda: not read_statistics(one.instance, one.shm_dir).cells)
-    finally:
-        holder.kill()
-        holder.communicate()
 
 
 COST = """
@@ -447,7 +404,7 @@ with shmmap.connect(sys.argv[1]) as client, shmmap.MapWindow(client, 30) as wind
 
 def test_a_client_loads_nothing_heavy_and_fits_40_megabytes(daemon: Factory, tmp_path: Path) -> None:
     one = daemon(make_map(tmp_path / "map", columns=2, rows=2).root)
-    said = run(COST, one.endpoint)
+    said = json.loads(outcomes(COST, one)[0])
     heavy = {"open3d", "numba", "scipy", "rich", "yaml", "xxhash", "lzf", "asyncio"}
     assert not heavy & set(said["modules"])
     assert said["megabytes"] < 40

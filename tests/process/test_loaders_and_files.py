@@ -32,9 +32,8 @@ def until_loaded(client: RawClient, x: float, y: float) -> RawCells:
     return first_answer(lambda: client.area(circle(x, y, 5)), lambda reply: not reply.failed)
 
 
-def test_one_load_for_many_clients(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
-    one = daemon(divided_map.root)
-    clients = [connect(one) for _ in range(8)]
+def test_one_load_for_many_clients(served: DaemonProcess, connect: Connect, divided_map: DividedMap) -> None:
+    clients = [connect(served) for _ in range(8)]
     requests = [client.send("area", circle(0, 0, 60), ["points"], 30.0) for client in clients]
     wanted = divided_map.in_circle(0, 0, 60)
     replies = [c.cells_reply(c.wait_for(r)) for c, r in zip(clients, requests, strict=True)]
@@ -116,13 +115,9 @@ def test_a_loader_that_is_killed_costs_one_cell(
     assert len(reply.cells) == 4
 
 
-def test_idle_loaders_that_are_killed_are_replaced(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
-) -> None:
-    one = daemon(divided_map.root)
-    client = connect(one)
+def test_idle_loaders_that_are_killed_are_replaced(served: DaemonProcess, client: RawClient) -> None:
     client.area(circle(0, 0, 25))
-    for pid in one.loaders():
+    for pid in served.loaders():
         os.kill(pid, signal.SIGKILL)
         assert wait_ended(pid)
     reply = client.area(circle(0, 0, 200))
@@ -206,9 +201,8 @@ def test_no_descriptor_is_left_for_a_finished_segment(
 
 @pytest.mark.parametrize("kind", ["missing", "directory", "empty", "truncated", "loop", "unreadable length"])
 def test_a_bad_file_is_reported_and_retried_when_it_is_whole(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap, kind: str
+    served: DaemonProcess, connect: Connect, divided_map: DividedMap, kind: str
 ) -> None:
-    one = daemon(divided_map.root)
     path = divided_map.pcd_dir / "0_0.pcd"
     whole = path.read_bytes()
     path.unlink()
@@ -223,7 +217,7 @@ def test_a_bad_file_is_reported_and_retried_when_it_is_whole(
             "unreadable length": whole.replace(b"POINTS 500", b"POINTS 4000000000"),
         }
         path.write_bytes(content[kind])
-    client = connect(one)
+    client = connect(served)
     reply = client.area(circle(0, 0, 5))
     (failure,) = reply.failed
     assert (failure.id.rsplit("/", 1)[-1], failure.code) == ("0_0.pcd", "load_failed")

@@ -29,7 +29,6 @@ from tests.support.daemon_process import ROOT, DaemonProcess, until
 from tests.support.pages import read_page
 from tests.support.process_costs import mappings_under
 
-Factory = Callable[..., DaemonProcess]
 METHODS = ("fork", "spawn", "forkserver")
 EXAMPLES = {
     "pool": r"32 cells, the highest point at \d+\.\d+ m",
