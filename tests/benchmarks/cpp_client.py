@@ -28,7 +28,7 @@ import numpy as np
 import shmmap
 from tests.benchmarks.warm_request import BLOCK, NEW, Warm, time_block
 from tests.support.cpp_client import INCLUDE
-from tests.support.daemon_process import DaemonProcess
+from tests.support.daemon_process import DaemonProcess, LineProcess
 from tests.support.divided_map import make_map
 
 __all__ = ["main"]
@@ -36,31 +36,24 @@ __all__ = ["main"]
 PROCESSES = 8
 
 
-class Program:
+class Program(LineProcess):
     """The client in C++ as a process."""
 
     def __init__(self, path: Path, endpoint: str) -> None:
-        self.process = subprocess.Popen([path], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        super().__init__(path)
         self.ask("connect", endpoint)
 
     def ask(self, *words: object) -> list[float]:
         """Say something; returns the numbers of the answer."""
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
-        self.process.stdin.write(" ".join(map(str, words)) + "\n")
-        self.process.stdin.flush()
-        return [float(word) for word in self.process.stdout.readline().split()]
+        self.write(" ".join(map(str, words)))
+        return [float(word) for word in self.read().split()]
 
     def private_kb(self) -> int:
         """Memory that the process has for itself, KiB."""
-        lines = Path(f"/proc/{self.process.pid}/smaps_rollup").read_text().splitlines()
+        lines = Path(f"/proc/{self.pid}/smaps_rollup").read_text().splitlines()
         return sum(
             int(line.split()[1]) for line in lines if line.startswith(("Private_Clean:", "Private_Dirty:"))
         )
-
-    def close(self) -> None:
-        """Let it end."""
-        self.process.communicate()
 
 
 def compiled(folder: Path) -> Path:
@@ -114,7 +107,7 @@ def requests_and_attaching(program: Path, root: Path, rounds: int) -> None:
             attached["Python"].append(attach_in_python(client, inside))
             attached["C++"].append(cpp.ask("attach")[0] / 1e3)
     finally:
-        cpp.close()
+        cpp.end()
         client.close()
         warm.close()
         one.stop()
@@ -143,7 +136,7 @@ def memory(program: Path, folder: Path) -> None:
         private = [some.private_kb() for some in programs]
     finally:
         for some in programs:
-            some.close()
+            some.end()
         one.stop()
         one.dispose()
     held = len(made.corners) * 65_536 * 16 / 1e6

@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 import hashlib
 import random
-import resource
 import subprocess
 import sys
 import tempfile
@@ -25,7 +24,7 @@ from collections import Counter
 from pathlib import Path
 
 from tests.support.daemon_process import ROOT
-from tests.support.fuzzing import CORPUS, TARGETS, corpus
+from tests.support.fuzzing import CORPUS, TARGETS, corpus, limit_memory
 
 ALLOWED_BYTES = 100 << 20
 CHILD_S = 30.0
@@ -36,9 +35,7 @@ def child(name: str, last_input: Path, seed: int, seconds: float) -> None:
     rng = random.Random(seed)
     target = TARGETS[name]
     pool = list(corpus(name).values())
-    pages = int(Path("/proc/self/statm").read_text().split()[0])
-    limit = pages * resource.getpagesize() + ALLOWED_BYTES
-    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    limit_memory(ALLOWED_BYTES)
     outcomes: Counter[str] = Counter()
     with last_input.open("r+b", buffering=0) as current:
         end_s = time.monotonic() + seconds

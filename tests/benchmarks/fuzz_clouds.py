@@ -14,11 +14,9 @@ from __future__ import annotations
 
 import io
 import random
-import resource
 import signal
 import struct
 import sys
-import time
 import warnings
 from pathlib import Path
 
@@ -30,7 +28,7 @@ from shmmap.errors import MapDataError
 from shmmap.formats.cloud import open_blocks, read_cloud
 from shmmap.formats.source_file import CAUSES
 from tests.support.cloud_bytes import random_ply
-from tests.support.fuzzing import fuzz_in_children, print_outcomes
+from tests.support.fuzzing import fuzz_in_children, limit_memory, repeat
 
 ALLOWED_BYTES = 200 << 20
 MAX_S = 10
@@ -166,31 +164,23 @@ def child(folder: Path, seed: int, seconds: float) -> int:
     """Fuzz for ``seconds``; the input of a finding stays in ``folder``."""
     rng = random.Random(seed)
     pool = seeds(folder)
-    outcomes: dict[str, int] = {}
     for suffix, data in pool:
         if check(folder / f"input{suffix}", data, rng) not in ("read", "compared"):
             raise AssertionError("a seed is refused")
     for old in folder.iterdir():
         old.unlink()
-    pages = int(Path("/proc/self/statm").read_text().split()[0])
-    limit = pages * resource.getpagesize() + ALLOWED_BYTES
-    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-    signal.alarm(0)
-    deadline = time.monotonic() + seconds
-    count, slowest = 0, 0.0
-    while time.monotonic() < deadline:
-        started = time.monotonic()
+    limit_memory(ALLOWED_BYTES)
+
+    def step() -> str:
         suffix, data = rng.choice(pool)
         path = folder / f"input{suffix}"
         signal.alarm(MAX_S)
         outcome = check(path, mutate(data, rng, [one for kind, one in pool if kind == suffix]), rng)
         signal.alarm(0)
         path.unlink()
-        slowest = max(slowest, time.monotonic() - started)
-        outcomes[outcome] = outcomes.get(outcome, 0) + 1
-        count += 1
-    print_outcomes(seed, count, slowest, outcomes)
-    return 0
+        return outcome
+
+    return repeat(step, seed, seconds)
 
 
 def main() -> int:

@@ -13,10 +13,8 @@ from __future__ import annotations
 
 import math
 import random
-import resource
 import struct
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +25,7 @@ from shmmap.formats.pcd import lzf
 from shmmap.formats.pcd.reader import PcdReader
 from shmmap.formats.source_file import CAUSES
 from tests.support.cloud_bytes import CODES, Field, Number, column, lzf_decode, lzf_encode, pcd
-from tests.support.fuzzing import fuzz_in_children, print_outcomes
+from tests.support.fuzzing import fuzz_in_children, limit_memory, repeat
 
 ENCODINGS = ("ascii", "binary", "binary_compressed")
 ALLOWED_BYTES = 100 << 20
@@ -149,26 +147,17 @@ def child(folder: Path, seed: int, seconds: float) -> int:
     rng = random.Random(seed)
     pool = seeds()
     path = folder / "input.pcd"
-    outcomes: dict[str, int] = {}
     for data in pool:
         if check_reader(path, data, rng) != "read":
             raise AssertionError("a seed is refused")
-    pages = int(Path("/proc/self/statm").read_text().split()[0])
-    limit = pages * resource.getpagesize() + ALLOWED_BYTES
-    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-    deadline = time.monotonic() + seconds
-    count, slowest = 0, 0.0
-    while time.monotonic() < deadline:
-        started = time.monotonic()
+    limit_memory(ALLOWED_BYTES)
+
+    def step() -> str:
         if rng.random() < 0.1:
-            outcome = check_decoder(rng)
-        else:
-            outcome = check_reader(path, mutate(rng.choice(pool), rng, pool), rng)
-        slowest = max(slowest, time.monotonic() - started)
-        outcomes[outcome] = outcomes.get(outcome, 0) + 1
-        count += 1
-    print_outcomes(seed, count, slowest, outcomes)
-    return 0
+            return check_decoder(rng)
+        return check_reader(path, mutate(rng.choice(pool), rng, pool), rng)
+
+    return repeat(step, seed, seconds)
 
 
 def main() -> int:

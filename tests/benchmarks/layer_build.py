@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import subprocess
 import tempfile
 import time
 from pathlib import Path
@@ -22,6 +21,7 @@ from numpy.typing import NDArray
 
 from shmmap.layers.build import build_layer
 from tests.support.compiled_programs import built_pcl_program
+from tests.support.daemon_process import LineProcess
 
 CELL_M = 20.0
 
@@ -53,21 +53,17 @@ class Pcl:
     """The C++ program."""
 
     def __init__(self, program: Path) -> None:
-        self.process = subprocess.Popen(
-            [str(program)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
-        )
+        self._program = LineProcess(program)
 
     def seconds(self, leaf: float, paths: list[Path]) -> tuple[float, int]:
         """CPU seconds for the statistics of these files, and their voxels."""
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
-        self.process.stdin.write(f"{leaf} {' '.join(map(str, paths))}\n")
-        took, voxels = self.process.stdout.readline().split()
+        self._program.write(f"{leaf} {' '.join(map(str, paths))}")
+        took, voxels = self._program.read().split()
         return float(took), int(voxels)
 
     def close(self) -> None:
         """End it."""
-        self.process.communicate()
+        self._program.end()
 
 
 def ours(leaf: float, clouds: list[NDArray[np.float32]]) -> float:

@@ -37,6 +37,7 @@ from shmmap.chunks.occupancy import Occupancy, ScanFilter
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.daemon.live.chunk_memory import ChunkFile, ChunkMemory, live_prefix
 from tests.benchmarks.street_data import data_dir, street
+from tests.support.daemon_process import LineProcess
 
 SHM = "/dev/shm"
 MAP_ID = bytes(16)
@@ -144,17 +145,11 @@ class OctoMap:
     """The C++ program."""
 
     def __init__(self, program: Path, *, discretize: bool) -> None:
-        self._process = subprocess.Popen(
-            [str(program), str(int(discretize))], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-            bufsize=1,
-        )  # fmt: skip
+        self._program = LineProcess(program, str(int(discretize)))
 
     def _ask(self, *words: object) -> float:
-        stdin, stdout = self._process.stdin, self._process.stdout
-        if stdin is None or stdout is None:
-            raise RuntimeError("no pipe to OctoMap")
-        print(*words, file=stdin, flush=True)
-        return float(stdout.readline())
+        self._program.write(" ".join(map(str, words)))
+        return float(self._program.read())
 
     def begin(self, resolution: float) -> None:
         """A new map."""
@@ -166,7 +161,7 @@ class OctoMap:
 
     def close(self) -> None:
         """End it."""
-        self._process.communicate()
+        self._program.end()
 
 
 def built_octomap(folder: Path) -> Path | None:

@@ -22,7 +22,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
-import multiprocessing
 import os
 import signal
 import subprocess
@@ -30,7 +29,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -43,9 +42,10 @@ from shmmap.errors import ShmmapError
 from shmmap.protocol import live as messages
 from shmmap.protocol.areas import BoxMessage
 from shmmap.protocol.codec import encode
+from tests.benchmarks.hostile.actors import Actor, Orders
 from tests.support.daemon_process import ROOT, DaemonProcess
 from tests.support.divided_map import make_map
-from tests.support.live_bench import MAP, RESOLUTION, percentiles
+from tests.support.live_bench import MAP, RESOLUTION, live_daemon, percentiles
 from tests.support.raw_client import RawClient
 
 BUDGET = 4 << 20
@@ -185,14 +185,14 @@ class Greedy:
 # --- honest readers -----------------------------------------------------------------------------
 
 
-def honest(endpoint: str, readers: int, pipe: Any) -> None:
-    """Look voxels of 512 chunks up, by some clients in turn, and list some; say what was wrong."""
+def honest(orders: Orders, endpoint: str, readers: int) -> tuple[int, int, list[str]]:
+    """Look voxels of 512 chunks up, by some clients in turn, and list some; returns what was wrong, too."""
     maps = [shmmap.connect(endpoint).live(MAP) for _ in range(readers)]
     rng = np.random.default_rng(os.getpid())
     looks = refused = 0
     wrong: list[str] = []
-    pipe.send("ready")
-    while not pipe.poll(0):
+    orders.say("ready")
+    while orders.go_on():
         for live in maps:
             first = int(rng.integers(0, 64 * AHEAD // 4))
             keys = np.array([(first + n // 4, n % 4, 0) for n in range(512)])
@@ -208,22 +208,16 @@ def honest(endpoint: str, readers: int, pipe: Any) -> None:
                 wrong += [f"listed {listed.log_odds[~good][:3]}"] if not good.all() else []
             except ShmmapError:
                 refused += 1
-    pipe.send((looks, refused, wrong))
+    return looks, refused, wrong
 
 
 class Honest:
     """Processes of honest readers, stopped for some seconds now and then."""
 
     def __init__(self, endpoint: str, processes: int, readers: int, stopped_s: float) -> None:
-        context = multiprocessing.get_context("spawn")
-        self._all = []
-        for _ in range(processes):
-            mine, theirs = context.Pipe()
-            process = context.Process(target=honest, args=(endpoint, readers, theirs))
-            process.start()
-            self._all.append((process, mine))
-        for _, pipe in self._all:
-            pipe.recv()
+        self._all = [Actor(honest, endpoint, readers, is_bystander=True) for _ in range(processes)]
+        for actor in self._all:
+            actor.said()
         self._stopped_s, self._ending = stopped_s, threading.Event()
         self._thread = threading.Thread(target=self._stop_some)
         self._thread.start()
@@ -231,33 +225,24 @@ class Honest:
     def _stop_some(self) -> None:
         rng = np.random.default_rng(5)
         while not self._ending.wait(rng.uniform(0.05, 0.5)):
-            process = self._all[int(rng.integers(len(self._all)))][0]
-            os.kill(process.pid or 0, signal.SIGSTOP)
+            pid = self._all[int(rng.integers(len(self._all)))].pid
+            os.kill(pid, signal.SIGSTOP)
             self._ending.wait(self._stopped_s)
-            os.kill(process.pid or 0, signal.SIGCONT)
+            os.kill(pid, signal.SIGCONT)
 
-    def end(self) -> tuple[int, int, list[str], list[int]]:
-        """End them; returns what they looked up, were refused and found wrong, and signals that ended any."""
+    def end(self) -> tuple[int, int, list[str], list[str]]:
+        """End them; returns what they looked up, were refused and found wrong, and why any ended before."""
         self._ending.set()
         self._thread.join()
         found: tuple[int, int, list[str]] = 0, 0, []
-        for process, pipe in self._all:
-            with contextlib.suppress(OSError, EOFError):
-                pipe.send("end")
-                looks, refused, wrong = pipe.recv()
+        ended = []
+        for actor in self._all:
+            try:
+                looks, refused, wrong = actor.end()
                 found = found[0] + looks, found[1] + refused, found[2] + wrong
-            process.join(60)
-        return *found, [process.exitcode for process, _ in self._all if process.exitcode]
-
-
-def daemon(stack: ExitStack, state: Path, map_path: str, *flags: str, **options: Any) -> DaemonProcess:
-    """A daemon that keeps a live map."""
-    state.mkdir(parents=True, exist_ok=True)
-    settings = state / "shmmap.toml"
-    settings.write_text(f'[live.{MAP}]\nresolution = {RESOLUTION}\npath = "{state}/map"\n')
-    one = DaemonProcess(map_path, "--config", str(settings), *flags, **options)
-    stack.callback(one.dispose)
-    return one
+            except RuntimeError as error:  # noqa: PERF203  the others are asked, too
+                ended.append(str(error))
+        return *found, ended
 
 
 def named_after(one: DaemonProcess, pid: int) -> float:
@@ -282,10 +267,8 @@ def scene_of_memory(args: argparse.Namespace) -> bool:
         path = stack.enter_context(mounted(CELLS + MAX_BYTES))
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="live_readers.")))
         cells = make_map(folder / "map", columns=10, rows=10, points=2000)
-        one = daemon(
-            stack, folder / "state", str(cells.root), "--budget", str(CELLS), "--live-budget", str(BUDGET),
-            shm_dir=path,
-        ).start()  # fmt: skip
+        flags = ["--budget", str(CELLS), "--live-budget", str(BUDGET)]
+        one = live_daemon(stack, folder / "state", cells.root, *flags, shm_dir=path)
         mapper = Mapper(one.endpoint)
         for number in range(8):
             mapper.send(chunks_at(number), 8)
@@ -308,13 +291,13 @@ def scene_of_memory(args: argparse.Namespace) -> bool:
             served += len(found) > 0 and not found.failed and not found.pending
             if len(beside) == 10:
                 named_s = named_after(one, keeper.process.pid)
-        looks, refused, wrong, signals = readers.end()
+        looks, refused, wrong, ended = readers.end()
         peak = sampler.end()
     met = (
         peak <= MAX_BYTES
         and served == len(beside)
         and not wrong
-        and not signals
+        and not ended
         and named_s <= 5.0
         and looks > 0
     )
@@ -323,9 +306,7 @@ def scene_of_memory(args: argparse.Namespace) -> bool:
     print(f"scans beside readers            {percentiles(beside)}")
     print(f"point cells                     {served} of {len(beside)} requests served")
     print(f"honest readers                  {looks} x 512 chunks, {refused} asked again, {len(wrong)} wrong")
-    print(
-        f"readers ended by a signal       {signals or 'none'}; one that touches what it maps: {toucher.ends}"
-    )
+    print(f"readers that ended early        {ended or 'none'}; one that touches what it maps: {toucher.ends}")
     print(f"doctor names chunks' holders    after {named_s:.1f} s   limit 5", *wrong[:3], sep="\n")
     return bool(met)
 
@@ -333,7 +314,7 @@ def scene_of_memory(args: argparse.Namespace) -> bool:
 # --- latency ------------------------------------------------------------------------------------
 
 
-def flooding(endpoint: str, chunks: int, in_flight: int, pipe: Any) -> None:
+def flooding(orders: Orders, endpoint: str, in_flight: int) -> int:
     """Keep requests in flight: pages of chunks, and lists of voxels."""
     clients = [RawClient(endpoint) for _ in range(4)]
     rng = np.random.default_rng(2)
@@ -353,44 +334,45 @@ def flooding(endpoint: str, chunks: int, in_flight: int, pipe: Any) -> None:
     for client in clients:
         for _ in range(in_flight // len(clients)):
             ask(client)
-    pipe.send("ready")
+    orders.say("ready")
     answers = 0
-    while not pipe.poll(0.0005):
+    while orders.go_on(0.0005):
         for client in clients:
             while client.readable():
                 client.receive_bytes()
                 answers += 1
                 ask(client)
-    pipe.send(answers)
     for client in clients:
         client.close()
+    return answers
 
 
-def moving(endpoint: str, readers: int, pipe: Any) -> None:
+def moving(orders: Orders, endpoint: str, readers: int) -> int:
     """Clients that drive, each 10 m/s somewhere else, and say so at 10 Hz."""
     maps = [shmmap.connect(endpoint).live(MAP) for _ in range(readers)]
-    pipe.send("ready")
+    orders.say("ready")
     moves, step, next_s = 0, 0, time.monotonic()
-    while not pipe.poll(max(0.0, next_s - time.monotonic())):
+    while orders.go_on(max(0.0, next_s - time.monotonic())):
         next_s = max(next_s + PERIOD_S, time.monotonic())
         step += 1
         for number, live in enumerate(maps):
             live.move_to(number * 60.0 + step, number * 55.0, 1.0)
             moves += 1
-    pipe.send(moves)
+    return moves
 
 
-def reading_disk(endpoint: str, readers: int, pipe: Any) -> None:
+def reading_disk(orders: Orders, endpoint: str, readers: int) -> int:
     """Clients that ask for voxels on the disk."""
     clients = [RawClient(endpoint) for _ in range(readers)]
     area = BoxMessage(0.0, 0.0, 2000.0, 2000.0)
     for number, client in enumerate(clients, 1):
         client.send_bytes(encode(messages.LiveVoxels(number, MAP, "free", area, "disk")))
-    pipe.send("ready")
-    pipe.poll(None)
-    pipe.send(0)
+    orders.say("ready")
+    while orders.go_on(60.0):
+        pass
     for client in clients:
         client.close()
+    return 0
 
 
 SLOW_DISK = """
@@ -405,24 +387,6 @@ if any("live.worker" in word for word in sys.orig_argv):
     folder.FolderToRead.read = slow
 """
 """``sitecustomize`` of the live worker: reading a file takes two seconds while there is a certain file."""
-
-
-class Beside:
-    """A process beside the mapper."""
-
-    def __init__(self, target: Callable[..., None], *arguments: Any) -> None:
-        context = multiprocessing.get_context("spawn")
-        self._pipe, theirs = context.Pipe()
-        self._process = context.Process(target=target, args=(*arguments, theirs))
-        self._process.start()
-        self._pipe.recv()
-
-    def end(self) -> int:
-        """End it; returns what it counted."""
-        self._pipe.send("end")
-        found: int = self._pipe.recv()
-        self._process.join()
-        return found
 
 
 def measured(mapper: Mapper, seconds: float) -> list[float]:
@@ -444,9 +408,8 @@ def scene_of_latency(args: argparse.Namespace) -> bool:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="live_readers.")))
         (hook := folder / "hook").mkdir()
         (hook / "sitecustomize.py").write_text(SLOW_DISK)
-        one = daemon(stack, folder / "state", "", "--live-budget", "1G")
-        one.environment["PYTHONPATH"] = f"{hook}:{ROOT}"
-        one.start()
+        environment = {"PYTHONPATH": f"{hook}:{ROOT}"}
+        one = live_daemon(stack, folder / "state", "", "--live-budget", "1G", environment=environment)
         mapper = Mapper(one.endpoint)
         side = int(args.chunks**0.5) + 1
         keys = [(x, y, 0) for x in range(side) for y in range(side)]
@@ -458,15 +421,16 @@ def scene_of_latency(args: argparse.Namespace) -> bool:
         print(f"{len(keys)} chunks; alone             {percentiles(alone)}")
         limit_s = 2 * float(np.percentile(alone, 99)) + 0.005
         for name, target, arguments in (
-            ("64 requests in flight", flooding, (args.chunks, 64)),
+            ("64 requests in flight", flooding, (64,)),
             ("20 readers that move", moving, (20,)),
             ("readers of the disk", reading_disk, (20,)),
         ):
             if target is reading_disk:
                 (hook / "sitecustomize.py.slow").touch()
-            other = Beside(target, one.endpoint, *arguments)
-            times = measured(mapper, args.seconds)
-            counted = other.end()
+            with Actor(target, one.endpoint, *arguments, is_bystander=True) as other:
+                other.said()
+                times = measured(mapper, args.seconds)
+                counted = other.end()
             met = float(np.percentile(times, 99)) <= limit_s
             good &= met
             print(

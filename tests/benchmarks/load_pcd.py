@@ -35,6 +35,7 @@ from shmmap.formats.cloud import read_pcd
 from shmmap.formats.pcd.writer import write_pcd
 from shmmap.layers.points import build_points
 from tests.benchmarks.street_data import street
+from tests.support.daemon_process import LineProcess
 
 SHM = "/dev/shm"
 HUGE = "shmmap, huge pages"
@@ -147,9 +148,7 @@ class Pcl:
             *libraries,
         ]
         subprocess.run(command, check=True, capture_output=True, text=True)
-        self._process = subprocess.Popen(
-            [str(binary)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
-        )
+        self._program = LineProcess(binary)
         self._folder = folder
 
     def round(self, kind: str) -> Round:
@@ -158,20 +157,14 @@ class Pcl:
         def run(paths: list[str]) -> float:
             listing = self._folder / "paths.txt"
             listing.write_text("".join(path + "\n" for path in paths))
-            stdin, stdout = self._process.stdin, self._process.stdout
-            if stdin is None or stdout is None:
-                raise RuntimeError("no pipe to the PCL process")
-            stdin.write(f"{kind} {listing}\n")
-            stdin.flush()
-            answer = stdout.readline().split()
-            if len(answer) != 2:
-                raise RuntimeError("the PCL process failed")
-            return float(answer[0])
+            self._program.write(f"{kind} {listing}")
+            seconds, _ = self._program.read().split()
+            return float(seconds)
 
         return run
 
     def close(self) -> None:
-        self._process.communicate()
+        self._program.end()
 
 
 def peers(folder: Path) -> tuple[dict[str, Round], Pcl | None]:

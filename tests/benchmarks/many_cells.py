@@ -54,7 +54,7 @@ from tests.benchmarks.hostile.stage import Report, Stage, lift
 from tests.benchmarks.make_many_cells import CELL_METRES
 from tests.support.command_line import Shmmap
 from tests.support.daemon_process import DaemonProcess
-from tests.support.process_costs import peak_bytes, proportional_bytes, resident_bytes
+from tests.support.process_costs import peak_bytes, processor_s, proportional_bytes, resident_bytes
 from tests.support.raw_client import RawClient, circle
 
 RADIUS_M: Final = 200.0
@@ -103,12 +103,6 @@ def seconds_to_start(one: DaemonProcess, *, lifted: bool) -> float:
     if not one.wait_ready(FIRST_START_S):
         raise SystemExit("the daemon is not ready")
     return time.perf_counter() - begin_s
-
-
-def processor_s(pid: int) -> float:
-    """Processor time of a process and all its threads so far."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def measure_starts(one: DaemonProcess, row: dict[str, float], *, lifted: bool) -> None:

@@ -11,13 +11,13 @@ from __future__ import annotations
 
 import argparse
 import statistics
-import subprocess
 import sys
 import tempfile
+from contextlib import ExitStack
 from pathlib import Path
 
 from tests.support.client_programs import FollowingClient
-from tests.support.daemon_process import ROOT, DaemonProcess
+from tests.support.daemon_process import DaemonProcess, LineProcess
 from tests.support.divided_map import DividedMap, make_map
 from tests.support.process_costs import proportional_bytes, proportional_bytes_under
 
@@ -58,25 +58,16 @@ def shared(made: DividedMap, count: int) -> tuple[list[int], list[int], list[int
 
 def private(made: DividedMap, count: int) -> list[int]:
     """PSS of processes that read the files themselves."""
-    command = [sys.executable, "-c", _PRIVATE, str(made.pcd_dir)]
-    processes = [
-        subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1, cwd=ROOT
-        )
-        for _ in range(count)
-    ]
-    try:
+    with ExitStack() as stack:
+        processes = [
+            stack.enter_context(LineProcess(sys.executable, "-c", _PRIVATE, str(made.pcd_dir)))
+            for _ in range(count)
+        ]
         for process in processes:
-            assert process.stdin is not None
-            process.stdin.write("\n")
+            process.write()
         for process in processes:
-            assert process.stdout is not None
-            process.stdout.readline()
-        return [proportional_bytes(p.pid) for p in processes]
-    finally:
-        for process in processes:
-            process.kill()
-            process.communicate()
+            process.read()
+        return [proportional_bytes(process.pid) for process in processes]
 
 
 def main() -> None:

@@ -31,10 +31,10 @@ from typing import Final
 import shmmap
 from tests.benchmarks.hostile.stage import lift
 from tests.benchmarks.make_many_cells import make_many_cells
-from tests.benchmarks.many_cells import processor_s, seconds_to_start
+from tests.benchmarks.many_cells import seconds_to_start
 from tests.support.daemon_process import DaemonProcess
 from tests.support.made_map import CELL_M, SHARD_M, ServedMadeMap, serve_made_map
-from tests.support.process_costs import resident_bytes
+from tests.support.process_costs import processor_s, resident_bytes
 from tests.support.slow_link import Plan, SlowLink, slow_link
 
 MBIT_S: Final = 20.0

@@ -49,7 +49,7 @@ from shmmap.origin.remote.published_object import (
 from shmmap.origin.remote.zstd_frame import unpack_frame
 from tests.benchmarks.hostile.stage import lift
 from tests.support.command_line import publish
-from tests.support.daemon_process import DaemonProcess
+from tests.support.daemon_process import DaemonProcess, LineProcess
 from tests.support.divided_map import Box, make_map
 from tests.support.slow_link import Plan, slow_link
 
@@ -213,11 +213,8 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         layers = ("--layer", NDT) if args.link else ()
         publish(map_to_publish(args.map, Path(folder)), f"{folder}/www", *layers)
-        command = [sys.executable, "-c", SERVER, f"{folder}/www"]
-        server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-        try:
-            assert server.stdout is not None
-            port = int(server.stdout.readline())
+        with LineProcess(sys.executable, "-c", SERVER, f"{folder}/www") as server:
+            port = int(server.read())
             url = f"http://127.0.0.1:{port}"
             store = open_store(url)
             current = read_current(store).current
@@ -227,9 +224,6 @@ def main() -> int:
             if args.link:
                 return over_link(port, root, shards, args.repeats or 3, lifted=args.lift)
             return processors(url, root, shards, args.repeats or 11)
-        finally:
-            server.kill()
-            server.wait()
 
 
 if __name__ == "__main__":

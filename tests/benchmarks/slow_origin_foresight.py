@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,45 +14,29 @@ from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.travel.motion import Motion
 from shmmap.geometry import Circle
 
-__all__ = ["Foresight", "Margin", "Nothing", "Policy", "Truth"]
+__all__ = ["Margin", "Nothing", "Policy", "Truth"]
 
 IsAbsent = Callable[[int, str], bool]
 MARGIN_M = 60.0
 
 
-class Foresight(Protocol):
-    """What `Prefetch` is to the daemon's scheduler."""
-
-    health: OriginHealth
-    more: bool
-
-    def asks(self, area: Circle) -> None:
-        """The client asks for an area."""
-
-    def next(self, catalogue: CatalogueView, now_s: float) -> Wish | None:
-        """Return what is to be fetched."""
-
-    def next_s(self, now_s: float) -> float:
-        """When to ask again though nothing happens."""
-
-
 class Nothing:
-    """What is asked for is fetched, and nothing else."""
+    """What is asked for is fetched, and nothing else; to the daemon's scheduler `Prefetch` is the same."""
 
     def __init__(self) -> None:
         self.health = OriginHealth()
         self.more = False
 
     def asks(self, area: Circle) -> None:
-        """Nothing follows from it."""
+        """The client asks for an area: nothing follows from it."""
 
     def next(self, catalogue: CatalogueView, now_s: float) -> Wish | None:
-        """Nothing."""
+        """Return what is to be fetched: nothing."""
         del catalogue, now_s
         return None
 
     def next_s(self, now_s: float) -> float:
-        """Never."""
+        """When to ask again though nothing happens: never."""
         del now_s
         return math.inf
 

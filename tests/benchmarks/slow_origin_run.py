@@ -24,7 +24,7 @@ from shmmap.geometry import Circle
 from shmmap.origin.catalogue import Catalogue
 from shmmap.protocol.messages import Intent
 from tests.benchmarks.slow_origin_drives import Drive
-from tests.benchmarks.slow_origin_foresight import Foresight, Margin, Nothing, Policy, Truth
+from tests.benchmarks.slow_origin_foresight import Margin, Nothing, Policy, Truth
 from tests.benchmarks.slow_origin_model import Counts, Query, SlowOrigin
 
 __all__ = ["ROWS", "Setting", "simulate"]
@@ -92,7 +92,7 @@ class _Simulation:
         self.route_m = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(drive.route, axis=0).T))))
         self.foresight = self._foresight()
 
-    def _foresight(self) -> Foresight:
+    def _foresight(self) -> Nothing:
         setting = self.setting
         if setting.row == "none":
             return Nothing()

@@ -179,6 +179,12 @@ def served(daemon: DaemonFactory, divided_map: DividedMap) -> DaemonProcess:
 
 
 @pytest.fixture
+def client(served: DaemonProcess, connect: Callable[..., RawClient]) -> RawClient:
+    """A raw session of that daemon."""
+    return connect(served)
+
+
+@pytest.fixture
 def bridge(served: DaemonProcess, dds: int) -> Iterator[BridgeProcess]:
     """A bridge of that daemon, in the test's domain."""
     from tests.support.bridge_process import BridgeProcess

@@ -75,18 +75,15 @@ def test_the_socket_and_the_statistics(service: DaemonProcess, uid: int, gid: in
     assert (as_user(uid, gid, "cksum", statistics).returncode == 0) == works
 
 
-def test_without_a_group_no_other_account_reads(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
-) -> None:
-    one = daemon(divided_map.root)
-    os.chmod(one.runtime_dir, 0o755)
-    os.chmod(one.shm_dir, 0o1777)
-    client = connect(one)
+def test_without_a_group_no_other_account_reads(served: DaemonProcess, connect: Connect) -> None:
+    os.chmod(served.runtime_dir, 0o755)
+    os.chmod(served.shm_dir, 0o1777)
+    client = connect(served)
     path = client.path(client.area(circle(10, 10, 1)).cells[0])
     found = attempts(path, OTHER_USER, OTHER_USER)
     assert 0 not in found.values(), found
     python = python_for_others()
-    assert as_user(OTHER_USER, OTHER_USER, python, "-I", "-c", CONNECT, one.endpoint).returncode != 0
+    assert as_user(OTHER_USER, OTHER_USER, python, "-I", "-c", CONNECT, served.endpoint).returncode != 0
 
 
 @pytest.fixture

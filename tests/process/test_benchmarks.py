@@ -53,9 +53,10 @@ print(json.dumps(results))
 """
 
 
-def started(*lines: str) -> dict[str, tuple[object, str, str]]:
+def started(*lines: str, data: Path | None = None) -> dict[str, tuple[object, str, str]]:
     """Return how each of these ended and what it printed; one process for all, they import the same."""
     environment = {key: value for key, value in os.environ.items() if key != "SHMMAP_TEST_DATA"}
+    environment |= {"SHMMAP_TEST_DATA": str(data)} if data else {}
     done = subprocess.run(
         [sys.executable, "-c", STARTS, *lines],
         cwd=ROOT,
@@ -87,28 +88,16 @@ def test_without_data_they_say_how_to_make_some() -> None:
 
 
 def test_every_row_of_what_once_held_others_up_has_a_scene() -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "tests.benchmarks.hostile_p99", "--list"],
-        cwd=ROOT,
-        check=True,
-        capture_output=True,
-        text=True,
-    )
+    _, listed, _ = started("hostile_p99 --list")["hostile_p99"]
     rows = [f"A{number}" for number in (*range(1, 10), 11, 12, 13, 16, 17, 21, 22)] + ["B3"]
-    assert [line.split()[0] for line in done.stdout.splitlines()] == [*rows, "churn", "worst-five"]
+    assert [line.split()[0] for line in listed.splitlines()] == [*rows, "churn", "worst-five"]
 
 
 def test_a_scene_that_is_over_no_limit_ends_well() -> None:
     """One of the quick ones, which time cannot fail: it shows that scenes can be played."""
-    done = subprocess.run(
-        [sys.executable, "-m", "tests.benchmarks.hostile_p99", "--scene", "A16"],
-        cwd=ROOT,
-        check=False,
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert done.stdout.splitlines()[-2].split() == ["A16", "-", "-", "-", "-", "-", "OK"]
+    code, printed, errors = started("hostile_p99 --scene A16")["hostile_p99"]
+    assert code == 0, printed + errors
+    assert printed.splitlines()[-2].split() == ["A16", "-", "-", "-", "-", "-", "OK"]
 
 
 def test_the_page_marks_those_that_need_data() -> None:
@@ -119,23 +108,11 @@ def test_localization_is_measured_on_data_that_anyone_can_make(tmp_path: Path) -
     make, export = PAGE.commands("data")
     assert make.startswith("python -m tests.benchmarks.make_data ")
     assert export.startswith("export SHMMAP_TEST_DATA=")
-    environment = {**os.environ, "SHMMAP_TEST_DATA": str(tmp_path / "data")}
-
-    def run(*words: str) -> str:
-        done = subprocess.run(
-            [sys.executable, "-m", *words],
-            cwd=ROOT,
-            env=environment,
-            check=False,
-            capture_output=True,
-            text=True,
-        )
-        assert done.returncode == 0, done.stderr
-        return done.stdout
-
-    run("tests.benchmarks.make_data", str(tmp_path / "data"), "--density", "20")
-    ended = run("tests.benchmarks.ndt_accuracy", "--seeds", "1", "--disturbance", "planar")
-    shares = dict(re.findall(r"^(.+?) +(\d+\.\d+)% within", ended, re.MULTILINE))
+    data = tmp_path / "data"
+    lines = f"make_data {data} --density 8", "ndt_accuracy --seeds 1 --disturbance planar"
+    ended = started(*lines, data=data)
+    assert [code for code, _, _ in ended.values()] == [None, None], ended
+    shares = dict(re.findall(r"^(.+?) +(\d+\.\d+)% within", ended["ndt_accuracy"][1], re.MULTILINE))
     assert len(shares) == 9
     assert shares["simulated scans, 0.5 m, 6000 points, planar, fine"] == "100.00"
     assert shares["generated city, 1500 points, planar, fine"] == "100.00"

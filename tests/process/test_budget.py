@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import Deadline
+from tests.support.daemon_process import Deadline, first_answer
 from tests.support.divided_map import DividedMap, make_map, random_points
 from tests.support.mapping_process import MappingProcess
 from tests.support.process_costs import MemoryWatch
@@ -254,9 +254,9 @@ def test_a_full_file_system_is_reported_and_survived(
     assert {f.code for f in reply.failed} == {"no_space"}
     assert len(holder.client.area(circle(0, 0, 5)).cells) == 4
     filler.unlink()
-    waiting = Deadline()
-    while waiting(bool(reply.failed)):
-        reply = holder.client.area(circle(60, 60, 15), wait=10.0)
+    reply = first_answer(
+        lambda: holder.client.area(circle(60, 60, 15), wait=10.0), lambda found: not found.failed
+    )
     assert names(reply.cells) == heavy_map.in_circle(60, 60, 15)
     holder.drop_all()
     assert re.search(r"loader (replaced|ended|could not start)", one.log) is None

@@ -48,10 +48,8 @@ def check_found(one: DaemonProcess, *options: str, **variables: str) -> None:
 
 
 def test_the_endpoint_is_enough(other_name: DaemonProcess) -> None:
+    """As an option, and as a variable."""
     check_found(other_name, "--endpoint", other_name.endpoint)
-
-
-def test_the_variable_is_enough(other_name: DaemonProcess) -> None:
     check_found(other_name, SHMMAP_ENDPOINT=f"ipc://{other_name.endpoint}")
 
 

@@ -13,16 +13,15 @@ import pytest
 import shmmap
 from tests.process.conftest import DaemonFactory
 from tests.support.command_line import publish
-from tests.support.daemon_process import Deadline
 from tests.support.divided_map import DividedMap, make_map
 from tests.support.map_stores import CEPH_PROGRAMS, BucketServer, CephServer
+from tests.support.published_daemon import ALL, all_cells
 
 if not os.environ.get("SHMMAP_TEST_CEPH"):
     pytest.skip("SHMMAP_TEST_CEPH is not set", allow_module_level=True)
 if missing := [name for name in CEPH_PROGRAMS if shutil.which(name) is None]:
     pytest.skip(f"Ceph is not installed: {', '.join(missing)}", allow_module_level=True)
 
-ALL = shmmap.Box(-1e6, -1e6, 1e6, 1e6)
 WARM = "0_0.pcd"
 
 
@@ -74,10 +73,7 @@ def test_daemons_of_the_store_are_killed_while_cells_are_fetched(
         assert [cell.version for cell in again] == [warm.version]
         if len(killed) > 1 or killed == ["client.rgw"]:
             ceph.repair()
-        waiting = Deadline()
-        while waiting(not (found := client.area(ALL, wait=5.0)).complete):
-            pass
-        assert columns_of(found) == right
+        assert columns_of(all_cells(client)) == right
 
 
 def test_a_disk_is_killed_while_a_map_is_published(

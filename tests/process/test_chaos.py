@@ -10,20 +10,17 @@ from __future__ import annotations
 import os
 import random
 import signal
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
-from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import DaemonProcess, Deadline
+from tests.support.daemon_process import DaemonProcess, until
 from tests.support.divided_map import DividedMap, random_points
 from tests.support.mapping_process import MappingProcess
 from tests.support.raw_client import RawClient, circle
 from tests.support.segment_reader import read_segment
 
-Connect = Callable[..., RawClient]
 STEPS = 60
 
 
@@ -112,9 +109,7 @@ class Life:
 
     def check_books(self) -> None:
         """The daemon's sums are those of the files."""
-        waiting = Deadline()
-        while waiting(not self._books_agree()):
-            pass
+        until(lambda: self._books_agree())
 
     def _books_agree(self) -> bool:
         counters = self.client.ask("stats")[4]
@@ -122,10 +117,8 @@ class Life:
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_a_random_life(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap, seed: int) -> None:
-    one = daemon(divided_map.root)
-    client = connect(one)
-    life = Life(one, client, divided_map, seed)
+def test_a_random_life(served: DaemonProcess, client: RawClient, divided_map: DividedMap, seed: int) -> None:
+    life = Life(served, client, divided_map, seed)
     actions = [
         life.begin_reading, life.begin_reading, life.begin_reading, life.check_one, life.check_one,
         life.toggle_one, life.toggle_one, life.kill_one, life.evict, life.evict_some, life.change,
@@ -142,5 +135,5 @@ def test_a_random_life(daemon: DaemonFactory, connect: Connect, divided_map: Div
         for reader in life.readers:
             reader.process.end()
     client.ask("evict")
-    one.until_segments(0, lambda: client.ask("stats"))
+    served.until_segments(0, lambda: client.ask("stats"))
     life.check_books()

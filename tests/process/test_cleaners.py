@@ -99,26 +99,25 @@ def test_retired_segments_that_a_cleaner_removes(daemon: DaemonFactory, divided_
 
 
 @pytest.mark.parametrize("how", ["cut", "emptied", "replaced"])
-def test_a_damaged_segment_is_loaded_again(daemon: DaemonFactory, divided_map: DividedMap, how: str) -> None:
+def test_a_damaged_segment_is_loaded_again(served: DaemonProcess, how: str) -> None:
     """Its cell fails at most until the daemon has looked, not until it is started again."""
-    one = daemon(divided_map.root)
-    with connect(one.endpoint) as client:
+    with connect(served.endpoint) as client:
         client.selected(["0_0.pcd"], wait=TIMEOUT_S)
-        (name,) = one.segments()
-        path = f"{one.shm_dir}/{name}"
+        (name,) = served.segments()
+        path = f"{served.shm_dir}/{name}"
         if how == "replaced":
             os.unlink(path)
             Path(path).write_bytes(b"")
         else:
             os.chmod(path, 0o600)  # an ordinary user may not write what it made read-only
             os.truncate(path, 4096 if how == "cut" else 0)
-    with connect(one.endpoint) as client:  # it has nothing mapped
-        until(lambda: len(client.selected(["0_0.pcd"], wait=1.0)) == 1, lambda: one.log)
+    with connect(served.endpoint) as client:  # it has nothing mapped
+        until(lambda: len(client.selected(["0_0.pcd"], wait=1.0)) == 1, lambda: served.log)
         assert len(client.selected(["0_0.pcd"], wait=TIMEOUT_S)[0].xyz) == 500
     if how == "replaced":
         Path(path).unlink(missing_ok=True)  # it came after the daemon had looked: it is the other program's
     else:
-        until(lambda: "cut_short=1" in one.log, lambda: one.log)
+        until(lambda: "cut_short=1" in served.log, lambda: served.log)
 
 
 @pytest.mark.parametrize("how", ["removed", "replaced", "removed twice"])

@@ -18,7 +18,7 @@ import pytest
 from shmmap import Box
 from shmmap import connect as connect_client
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import ROOT, DaemonProcess, Deadline
+from tests.support.daemon_process import ROOT, DaemonProcess, LineProcess, until
 from tests.support.divided_map import DividedMap
 from tests.support.mapping_process import MappingProcess
 from tests.support.raw_client import RawClient, circle
@@ -80,33 +80,20 @@ def boxed_client(
         "SHMMAP_SHM_DIR": f"{box}/segments",
         "PYTHONPATH": str(ROOT),
     }
-    process = subprocess.Popen(
-        [*command, "sh", "-c", _BOX, "sh", sys.executable, "-c", _CLIENT, Path(one.endpoint).name],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        env=environment,
-    )
-    try:
-        assert process.stdout is not None
-        said = json.loads(process.stdout.readline())
+    words = [*command, "sh", "-c", _BOX, "sh", sys.executable, "-c", _CLIENT, Path(one.endpoint).name]
+    with LineProcess(*words, env=environment) as process:
+        said = json.loads(process.read())
         (inner,) = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
         yield int(inner), said
-    finally:
-        process.kill()
-        process.communicate()
 
 
-def test_a_client_in_a_container(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap, tmp_path: Path
-) -> None:
+def test_a_client_in_a_container(served: DaemonProcess, client: RawClient, tmp_path: Path) -> None:
     """It reads the same bytes, is known by its pid outside, and pins as any other client does."""
-    one = daemon(divided_map.root)
-    client = connect(one)
-    with connect_client(one.endpoint) as outside:
+    with connect_client(served.endpoint) as outside:
         cells = outside.area(Box(-60.0, -60.0, 60.0, 60.0)).cells
         expected = {cell.id.rpartition("/")[2]: zlib.crc32(cell["xyz"].tobytes()) for cell in cells}
         del cells
-    with boxed_client(one, tmp_path / "box") as (pid, said):
+    with boxed_client(served, tmp_path / "box") as (pid, said):
         assert said == {"pid": 1, "sums": expected}
         rows = {row[4]: row for row in client.ask("stats")[5]}
         assert rows["boxed"][1] == pid
@@ -115,16 +102,11 @@ def test_a_client_in_a_container(
         freed = client.ask("evict")
         assert (freed[2], freed[3]) == (0, len(expected))
         os.kill(pid, signal.SIGKILL)
-        waiting = Deadline()
-        while waiting(bool(one.segments()) or len(client.ask("stats")[5]) > 1):
-            pass
+        until(lambda: not served.segments() and len(client.ask("stats")[5]) <= 1)
 
 
-def test_a_container_that_lacks_the_segments_gets_an_error(
-    daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path
-) -> None:
-    one = daemon(divided_map.root)
-    with boxed_client(one, tmp_path / "box", segments=False) as (_, said):
+def test_a_container_that_lacks_the_segments_gets_an_error(served: DaemonProcess, tmp_path: Path) -> None:
+    with boxed_client(served, tmp_path / "box", segments=False) as (_, said):
         assert f"segments are not in {tmp_path}/box/segments" in str(said["error"])
         assert "SHMMAP_SHM_DIR" in str(said["error"])
 

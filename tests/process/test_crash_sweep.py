@@ -19,7 +19,7 @@ from shmmap.errors import InternalError, StaleSocket
 from shmmap.failpoints import CLIENT_STEPS, DAEMON_STEPS, WORKER_STEPS
 from tests.process.conftest import DaemonFactory
 from tests.support.cpp_client import CppClient
-from tests.support.daemon_process import ROOT, DaemonProcess, Deadline
+from tests.support.daemon_process import ROOT, DaemonProcess, Deadline, until
 from tests.support.divided_map import DividedMap, random_points
 from tests.support.mapping_process import MappingProcess
 from tests.support.segment_reader import assert_right, whole
@@ -151,9 +151,7 @@ def test_daemon_and_worker(
         assert keeper.restarts == label.startswith("daemon.")
     with shmmap.connect(one.endpoint) as client:
         assert_right(whole(client, 0, 0, 500), divided_map, sorted(divided_map.corners))
-        waiting = Deadline()
-        while waiting(not _books_agree(one, client)):
-            pass
+        until(lambda: _books_agree(one, client))
         client.evict()
         one.until_segments(0, client.stats)
 
@@ -207,6 +205,4 @@ def test_client(
         assert other.evict().pinned == len(held)
         one.until_segments(len(held), lambda: other.stats())
         assert_right(whole(other, 0, 0, 30), divided_map, near)
-        waiting = Deadline()
-        while waiting(len(other.stats().sessions) > 1):
-            pass
+        until(lambda: len(other.stats().sessions) <= 1)

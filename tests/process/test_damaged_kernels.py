@@ -17,7 +17,7 @@ import shmmap
 from shmmap import kernel_cache
 from shmmap.layers.build import compile_kernels
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import DaemonProcess, Deadline, until
+from tests.support.daemon_process import DaemonProcess, until
 from tests.support.divided_map import DividedMap
 
 
@@ -118,9 +118,7 @@ def test_what_layers_need_is_compiled_once(
 ) -> None:
     kernels = tmp_path / "kernels"
     one = daemon(divided_map.root, environment={"NUMBA_CACHE_DIR": str(kernels)})
-    waiting = Deadline()
-    while waiting(not marks(kernels)):
-        pass
+    until(lambda: marks(kernels))
     made = compiled(kernels)
     assert {name.split("-")[0] for name in made if name.startswith("kernels.")}
     with shmmap.connect(one.endpoint) as client:
@@ -140,8 +138,6 @@ def test_a_daemon_that_ends_meanwhile_leaves_nothing(
     """The test's end looks for processes that are left."""
     kernels = tmp_path / "kernels"
     one = daemon(divided_map.root, environment={"NUMBA_CACHE_DIR": str(kernels)})
-    waiting = Deadline()
-    while waiting(not list(kernels.glob("layers-*.lock"))):
-        pass
+    until(lambda: list(kernels.glob("layers-*.lock")))
     one.stop()
     assert not marks(kernels)

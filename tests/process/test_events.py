@@ -4,9 +4,7 @@
 from __future__ import annotations
 
 import os
-import signal
 import stat
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -20,7 +18,7 @@ from shmmap.events import EventStream, MissedEvents
 from shmmap.protocol import events as e
 from tests.process.conftest import DaemonFactory
 from tests.support.cpp_client import CppEventStream
-from tests.support.daemon_process import DaemonProcess
+from tests.support.daemon_process import DaemonProcess, LineProcess, stop
 from tests.support.divided_map import DividedMap
 from tests.support.message_pack import unpack
 from tests.support.raw_client import RawClient
@@ -62,11 +60,10 @@ def kinds(found: list[Any]) -> list[str]:
 
 
 def test_events_come_in_order(
-    daemon: DaemonFactory, connect: Connect, listen: Listen, divided_map: DividedMap
+    served: DaemonProcess, connect: Connect, listen: Listen, divided_map: DividedMap
 ) -> None:
-    one = daemon(divided_map.root)
-    stream = listen(one, since=60)
-    client = connect(one, name="driver")
+    stream = listen(served, since=60)
+    client = connect(served, name="driver")
     loaded = client.selected(["0_0.pcd"]).cells[0]
     divided_map.change("0_0.pcd", 5)
     divided_map.remove_cell("20_20.pcd")
@@ -116,23 +113,20 @@ def test_retries_and_pressure(
     assert pressure.refused >= 1
 
 
-def test_the_stream_goes_on_in_the_next_run(
-    daemon: DaemonFactory, connect: Connect, listen: Listen, divided_map: DividedMap
-) -> None:
-    one = daemon(divided_map.root)
-    stream = listen(one)
-    connect(one, name="first").selected(["0_0.pcd"])
+def test_the_stream_goes_on_in_the_next_run(served: DaemonProcess, connect: Connect, listen: Listen) -> None:
+    stream = listen(served)
+    connect(served, name="first").selected(["0_0.pcd"])
     until(stream, lambda h: isinstance(h, e.Loaded))
     before = stream.epoch
-    one.kill()
-    one.start()
-    connect(one, name="second").selected(["0_-20.pcd"])
+    served.kill()
+    served.start()
+    connect(served, name="second").selected(["0_-20.pcd"])
     found = until(stream, lambda h: isinstance(h, e.Loaded) and h.id == "0_-20.pcd")
     after = [h for h in found if h.epoch != before]
     assert [h.seq for h in after] == list(range(1, len(after) + 1))
     assert isinstance(after[0], e.Epoch)
     assert stream.epoch == after[0].epoch
-    assert one.stop() == 0
+    assert served.stop() == 0
     assert until(stream, lambda h: isinstance(h, e.Epoch))[-1].what == "stopping"
 
 
@@ -142,12 +136,9 @@ def test_a_beginning_that_makes_no_sense(since: float) -> None:
         EventStream("/nowhere.sock", since=since)
 
 
-def test_a_gap_is_noticed_and_closed(
-    daemon: DaemonFactory, connect: Connect, listen: Listen, divided_map: DividedMap
-) -> None:
+def test_a_gap_is_noticed_and_closed(served: DaemonProcess, connect: Connect, listen: Listen) -> None:
     """More happens than any queue holds while the listener does not read: the oldest are `MissedEvents`."""
-    one = daemon(divided_map.root)
-    client, stream = connect(one), listen(one)
+    client, stream = connect(served), listen(served)
     client.selected(["0_0.pcd"])
     for _ in range(3000):  # two events each: the daemon remembers 4096
         client.ask("evict", ["0_0.pcd"])
@@ -178,34 +169,22 @@ sys.stdin.read()
 """
 
 
-def test_a_stopped_listener_delays_no_other(
-    daemon: DaemonFactory, connect: Connect, listen: Listen, divided_map: DividedMap
-) -> None:
-    one = daemon(divided_map.root)
-    client, stream = connect(one), listen(one)
-    path = f"{one.runtime_dir}/{one.instance}.events.sock"
-    with subprocess.Popen(
-        [sys.executable, "-c", _STOPPED, path], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    ) as listener:
-        assert listener.stdout is not None
-        assert listener.stdout.readline() == b"up\n"
-        listener.send_signal(signal.SIGSTOP)
-        os.waitpid(listener.pid, os.WUNTRACED)
+def test_a_stopped_listener_delays_no_other(served: DaemonProcess, connect: Connect, listen: Listen) -> None:
+    client, stream = connect(served), listen(served)
+    path = f"{served.runtime_dir}/{served.instance}.events.sock"
+    with LineProcess(sys.executable, "-c", _STOPPED, path) as listener:
+        assert listener.read() == "up"
+        stop(listener.pid)
         for _ in range(1500):  # far more than its queue
             client.ask("evict", ["0_0.pcd"])
             client.selected(["0_0.pcd"])
         client.selected(["20_20.pcd"])
         found = until(stream, lambda h: isinstance(h, e.Loaded) and h.id == "20_20.pcd")
         assert not [h for h in found if isinstance(h, MissedEvents)]
-        listener.kill()
 
 
-def test_a_client_written_from_the_document(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
-) -> None:
+def test_a_client_written_from_the_document(served: DaemonProcess, client: RawClient) -> None:
     """Subscribe first, then ask what there was: no event comes twice or is missed."""
-    one = daemon(divided_map.root)
-    client = connect(one)
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     with context, context.socket(zmq.SUB) as socket:
         socket.connect(f"ipc://{client.hello()[19]}")
@@ -225,21 +204,19 @@ def test_a_client_written_from_the_document(
         assert event[:2] == ["loaded", page[4]]
 
 
-def test_permissions_are_those_of_requests(daemon: DaemonFactory, divided_map: DividedMap) -> None:
-    one = daemon(divided_map.root)
-    paths = [one.endpoint, f"{one.runtime_dir}/{one.instance}.events.sock"]
+def test_permissions_are_those_of_requests(served: DaemonProcess) -> None:
+    paths = [served.endpoint, f"{served.runtime_dir}/{served.instance}.events.sock"]
     modes = [os.stat(path) for path in paths]
     assert len({(stat.S_IMODE(m.st_mode), m.st_uid, m.st_gid) for m in modes}) == 1
-    assert one.stop() == 0
+    assert served.stop() == 0
     assert not [path for path in paths if os.path.exists(path)]
 
 
 def test_only_everything_can_be_subscribed_to(
-    daemon: DaemonFactory, connect: Connect, listen: Listen, divided_map: DividedMap
+    served: DaemonProcess, connect: Connect, listen: Listen
 ) -> None:
     """Subscriptions to very many prefixes, which would be kept, end the connection; others go on."""
-    one = daemon(divided_map.root)
-    client, stream = connect(one), listen(one)
+    client, stream = connect(served), listen(served)
     context: zmq.Context[Any] = zmq.Context()
     greedy = context.socket(zmq.SUB)
     try:
@@ -248,11 +225,11 @@ def test_only_everything_can_be_subscribed_to(
         monitor = greedy.get_monitor_socket(zmq.EVENT_DISCONNECTED)
         for number in range(1000):
             greedy.subscribe(b"prefix %d" % number)
-        greedy.connect("ipc://" + one.endpoint.removesuffix(".sock") + ".events.sock")
+        greedy.connect("ipc://" + served.endpoint.removesuffix(".sock") + ".events.sock")
         assert monitor.poll(30_000), "the connection stays"
     finally:
         greedy.disable_monitor()
         context.destroy(linger=0)
-    assert f"connections ended pid={os.getpid()} count=1" in one.log
+    assert f"connections ended pid={os.getpid()} count=1" in served.log
     client.selected(["0_0.pcd"])
     until(stream, lambda h: isinstance(h, e.Loaded))

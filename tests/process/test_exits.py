@@ -10,7 +10,6 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
 
 import pytest
 
@@ -18,7 +17,6 @@ import shmmap
 from shmmap.errors import BadRequest
 from tests.benchmarks.exits import SCENES, Ends, end_often
 from tests.support.daemon_process import DaemonProcess
-from tests.support.divided_map import DividedMap
 
 EXITS = 4
 
@@ -28,18 +26,17 @@ def test_a_program_ends_quietly(standing: DaemonProcess, scene: str) -> None:
     assert end_often(standing.endpoint, *SCENES[scene], EXITS) == Ends(0, 0, 0, "")
 
 
-def test_no_client_waits_for_the_answer_of_a_daemon_that_stands_still(
-    daemon: Callable[..., DaemonProcess], divided_map: DividedMap
-) -> None:
-    one = daemon(divided_map.root)
+def test_no_client_waits_for_the_answer_of_a_daemon_that_stands_still(served: DaemonProcess) -> None:
     setup = (
         "import os, signal; client = shmmap.connect(endpoint, timeout=600)\n"
         "os.kill(client.welcome.pid, signal.SIGSTOP)"
     )
     try:
-        assert end_often(one.endpoint, setup, "asked.set(); client.around(0, 0, 50)", 1) == Ends(0, 0, 0, "")
+        assert end_often(served.endpoint, setup, "asked.set(); client.around(0, 0, 50)", 1) == Ends(
+            0, 0, 0, ""
+        )
     finally:
-        one.send(signal.SIGCONT)
+        served.send(signal.SIGCONT)
 
 
 def test_threads_that_python_waits_for_ask_to_their_end(standing: DaemonProcess) -> None:

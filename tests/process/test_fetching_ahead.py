@@ -15,7 +15,7 @@ from shmmap.protocol import events as e
 from tests.process.conftest import DaemonFactory
 from tests.support.command_line import Shmmap
 from tests.support.cpp_client import CppEventStream
-from tests.support.daemon_process import DaemonProcess, Deadline
+from tests.support.daemon_process import DaemonProcess, Deadline, first_answer, until
 from tests.support.divided_map import DividedMap, make_map
 
 pytestmark = pytest.mark.usefixtures("layer_kernels")
@@ -49,7 +49,7 @@ def listen(
         stream.close()
 
 
-def until(stream: Any, fits: Callable[[Any], bool]) -> Any:
+def next_event(stream: Any, fits: Callable[[Any], bool]) -> Any:
     """Return the first event that fits."""
     while True:
         happening = stream.next(TIMEOUT_S)
@@ -60,11 +60,7 @@ def until(stream: Any, fits: Callable[[Any], bool]) -> Any:
 
 def until_ahead(shmmap: Shmmap, fits: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
     """Read the counters of prefetching until they fit."""
-    waiting = Deadline()
-    ahead_now: dict[str, Any] = shmmap.json("status")["ahead"]
-    while waiting(not fits(ahead_now)):
-        ahead_now = shmmap.json("status")["ahead"]
-    return ahead_now
+    return first_answer(lambda: shmmap.json("status")["ahead"], fits)
 
 
 def listed(shmmap: Shmmap, state: str) -> set[str]:
@@ -88,9 +84,8 @@ def test_a_drive_through_a_time_without_the_files(
     marks = [Path(street.id(name) + ".offline") for name in street.corners]
     with MapWindow(one.endpoint, 6.0, name="driver") as window:
         assert window.move_to(-150, 0, vx=5.0, route=EAST, wait=TIMEOUT_S).complete
-        fetched, waiting = {f"{x}_{y}.pcd" for x in (-140, -120, -100) for y in (-20, 0)}, Deadline()
-        while waiting(not fetched <= listed(shmmap, "ahead")):  # for the ten seconds of --outage-tolerance
-            pass
+        fetched = {f"{x}_{y}.pcd" for x in (-140, -120, -100) for y in (-20, 0)}
+        until(lambda: fetched <= listed(shmmap, "ahead"))  # for the ten seconds of --outage-tolerance
         ahead_now = shmmap.json("status")["ahead"]
         assert (ahead_now["outage_tolerance_s"], ahead_now["prefetch_started"] >= len(fetched)) == (
             10.0,
@@ -107,7 +102,7 @@ def test_a_drive_through_a_time_without_the_files(
             "moving clients waited for no cell in the last 10 min",
         )
         for stream in streams:
-            event = until(stream, lambda h: isinstance(h, e.Loaded) and h.id == "-120_0.pcd")
+            event = next_event(stream, lambda h: isinstance(h, e.Loaded) and h.id == "-120_0.pcd")
             assert event.ahead
         assert listed(shmmap, "resident") >= {"-160_0.pcd", "-160_-20.pcd"} | fetched
         assert "+ fetched ahead" in shmmap("map").splitlines()[-2]
@@ -135,7 +130,7 @@ def test_a_drive_through_a_time_without_the_files(
             x = min(x + 20, 100)
             window.move_to(x, 0, vx=5.0, route=EAST)
         for stream in streams:
-            late = until(stream, lambda h: isinstance(h, e.PrefetchMiss))
+            late = next_event(stream, lambda h: isinstance(h, e.PrefetchMiss))
             assert (late.client, late.layer) == ("driver", "points")
             assert 1 <= late.cells <= len(street.corners)
             assert late.id in set(street.corners) - fetched
@@ -167,9 +162,9 @@ def test_switched_off(daemon: DaemonFactory, street: DividedMap, tmp_path: Path)
     with MapWindow(one.endpoint, 6.0, background=False) as window:
         window.move_to(-150, 0, vx=5.0, route=EAST, wait=TIMEOUT_S)
         window.move_to(-110, 0, vx=5.0, route=EAST, wait=TIMEOUT_S)
-        waiting = Deadline()
-        while waiting((finding := prefetching(shmmap))["advice"] != "raise --prefetch-share"):
-            pass
+        finding = first_answer(
+            lambda: prefetching(shmmap), lambda one: one["advice"] == "raise --prefetch-share"
+        )
     assert finding["fact"] == "off; moving clients waited for 2 cells in the last 10 min"
     ahead_now = shmmap.json("status")["ahead"]
     assert (ahead_now["prefetch_misses"], ahead_now["prefetch_started"]) == (2, 0)
@@ -185,9 +180,9 @@ def test_load_times_by_what_was_done(daemon: DaemonFactory, divided_map: Divided
         with connect(one.endpoint, timeout=TIMEOUT_S) as client:
             for layer in ("voxel(leaf=2.0)", "points"):
                 client.area(Circle(0, 0, 1), layer, wait=TIMEOUT_S).raise_for_failures()
-        waiting = Deadline()
-        while waiting((found := shmmap.json("top")["latency_s"])["load"]["count"] < sum(wanted)):
-            pass
+        found = first_answer(
+            lambda: shmmap.json("top")["latency_s"], lambda one: one["load"]["count"] >= sum(wanted)
+        )
         assert [found[name]["count"] for name in names] == [sum(wanted), *wanted]
         assert all(found[name]["p50"] > 0.0 for name in names if found[name]["count"])
 

@@ -183,14 +183,14 @@ def test_on_the_real_map(
     data_dir: Path,
     followers: Callable[[str], list[Follower]],
 ) -> None:
-    """The recorded poses, radius 40 m."""
+    """Every other one of the recorded poses, radius 40 m."""
     source = read_pcd(data_dir / "kitti0005_map" / "map_static_v005.pcd")
     made = cut(source, tmp_path / "map")
     assert len(made.corners) == 59
     table = np.loadtxt(data_dir / "kitti0005_scans" / "poses_all_tum.txt")
-    poses = [(float(x), float(y)) for x, y in table[:, 1:3]]
+    poses = [(float(x), float(y)) for x, y in table[::2, 1:3]]
     clients, reload = start(daemon, connect, made, followers)
-    follow(clients, Expected(made), poses, 40.0, reload, {50, 100})
+    follow(clients, Expected(made), poses, 40.0, reload, {25, 50})
 
 
 def test_on_the_tiled_map(

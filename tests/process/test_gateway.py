@@ -16,16 +16,16 @@ import pytest
 import shmmap
 from tests.process.conftest import DaemonFactory
 from tests.support.command_line import publish
-from tests.support.daemon_process import Deadline
+from tests.support.daemon_process import first_answer
 from tests.support.divided_map import make_map
 from tests.support.pages import read_page
+from tests.support.published_daemon import ALL, all_cells
 from tests.support.web_servers import FaultyWeb, Nginx, faulty_web, free_port, needed_nginx
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 pytest.importorskip("obstore", reason="obstore is not installed")
 
 PAGE = read_page("shmmap/publishing/GATEWAY.md")
-ALL = shmmap.Box(-1e6, -1e6, 1e6, 1e6)
 ASKERS = 16
 
 
@@ -123,9 +123,7 @@ def test_a_new_version_comes_through(
         before = client.area(ALL, wait=120.0).map_version
         other = make_map(tmp_path / "other", columns=3, rows=3, points=200)
         publish(other.root, origin.folder / "town")
-        waiting = Deadline()
-        while waiting(client.area(ALL, wait=5.0).map_version == before):
-            client.reload()
+        first_answer(client.reload, lambda one: one.map_version != before)
         assert client.area(ALL, wait=120.0).complete
     assert ("town/CURRENT", 200) in origin.requests()
 
@@ -142,7 +140,4 @@ def test_what_it_does_not_have_is_offline_while_the_server_is_away(
         assert {failure.code for failure in cells.failed} == {"offline"}
         assert {cell.id for cell in near} <= {cell.id for cell in cells}
         origin.listen()
-        waiting = Deadline()
-        while waiting(not (cells := client.area(ALL, wait=5.0)).complete):
-            pass
-        assert len(cells) == 9
+        assert len(all_cells(client)) == 9

@@ -8,10 +8,8 @@ import os
 import random
 import signal
 import socket
-import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -19,33 +17,28 @@ import zmq
 
 from tests.process.conftest import DaemonFactory
 from tests.support.accounts import GROUP, MEMBER, python_for_others
-from tests.support.daemon_process import ROOT, DaemonProcess, Deadline
+from tests.support.daemon_process import DaemonProcess, LineProcess, until
 from tests.support.divided_map import DividedMap
 from tests.support.message_pack import pack
 from tests.support.process_costs import descriptors, peak_bytes, resident_bytes
-from tests.support.raw_client import DaemonError, RawClient, circle
+from tests.support.raw_client import RawClient, circle
 
 Connect = Callable[..., RawClient]
 
 
-def test_a_frame_larger_than_any_request(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
-) -> None:
+def test_a_frame_larger_than_any_request(served: DaemonProcess, client: RawClient, connect: Connect) -> None:
     """The socket itself ends the connection: the daemon never holds those bytes."""
-    one = daemon(divided_map.root)
-    client = connect(one)
-    before = peak_bytes(one.pid)
-    big = connect(one)
+    before = peak_bytes(served.pid)
+    big = connect(served)
     big.send_bytes(bytes(100_000_000))
     assert len(client.area(circle(0, 0, 5)).cells) == 4
-    assert peak_bytes(one.pid) - before < 16 << 20
+    assert peak_bytes(served.pid) - before < 16 << 20
 
 
-def test_a_flood_that_never_listens(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
-    one = daemon(divided_map.root)
-    client, deaf = connect(one), connect(one)
+def test_a_flood_that_never_listens(served: DaemonProcess, connect: Connect) -> None:
+    client, deaf = connect(served), connect(served)
     client.area(circle(0, 0, 60))
-    before = resident_bytes(one.pid)
+    before = resident_bytes(served.pid)
     request = pack(["area", 1, circle(0, 0, 60), ["points"], 10.0])
     deaf.socket.setsockopt(zmq.SNDTIMEO, 0)
     sent = 0
@@ -59,12 +52,10 @@ def test_a_flood_that_never_listens(daemon: DaemonFactory, connect: Connect, div
             assert len(client.area(circle(0, 0, 5)).cells) == 4
     assert sent > 1000
     assert len(client.area(circle(0, 0, 5)).cells) == 4
-    assert resident_bytes(one.pid) - before < 64 << 20
+    assert resident_bytes(served.pid) - before < 64 << 20
 
 
-def test_many_frames_and_no_frames(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
-    one = daemon(divided_map.root)
-    client = connect(one)
+def test_many_frames_and_no_frames(served: DaemonProcess, client: RawClient) -> None:
     client.socket.send_multipart([b"", pack(["stats", 1])])
     assert client.receive()[0] == "error"
     client.socket.send_multipart([pack(["stats", 1])] * 50)
@@ -72,27 +63,21 @@ def test_many_frames_and_no_frames(daemon: DaemonFactory, connect: Connect, divi
     assert len(client.area(circle(0, 0, 5)).cells) == 4
 
 
-def test_bytes_that_are_no_zeromq(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
-    one = daemon(divided_map.root)
-    client = connect(one)
+def test_bytes_that_are_no_zeromq(served: DaemonProcess, client: RawClient) -> None:
     client.area(circle(0, 0, 5))
     rng = random.Random(4)
-    before = descriptors(one.pid)
+    before = descriptors(served.pid)
     for _ in range(20):
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as other:
-            other.connect(one.endpoint)
+            other.connect(served.endpoint)
             other.send(rng.randbytes(rng.randrange(1, 500)))
     for _ in range(50):
         assert len(client.area(circle(0, 0, 5)).cells) == 4
-    waiting = Deadline()
-    while waiting(descriptors(one.pid) > before):
-        client.ask("stats")
+    until(lambda: descriptors(served.pid) <= before)
 
 
-def test_random_messages(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
+def test_random_messages(served: DaemonProcess, client: RawClient, connect: Connect) -> None:
     """Well-formed MessagePack of the wrong shapes; every one is answered, none does harm."""
-    one = daemon(divided_map.root)
-    client = connect(one)
     rng = random.Random(6)
     tags = ["area", "differential", "selected", "metadata", "release", "show", "hello", "stats", "x"]
     values: list[Any] = [
@@ -127,9 +112,9 @@ def test_random_messages(daemon: DaemonFactory, connect: Connect, divided_map: D
         client.send_bytes(pack([tag, number, *(rng.choice(values) for _ in range(rng.randrange(7)))]))
         reply = client.receive()
         assert reply[1] == number
-        assert reply[0] != "error" or reply[2] != "internal", (reply, one.log[-2000:])
-    assert "defect" not in one.log
-    fresh = connect(one)
+        assert reply[0] != "error" or reply[2] != "internal", (reply, served.log[-2000:])
+    assert "defect" not in served.log
+    fresh = connect(served)
     assert len(fresh.area(circle(0, 0, 5)).cells) == 4
 
 
@@ -144,42 +129,27 @@ sys.stdin.read()
 """
 
 
-def ask_and_wait(one: DaemonProcess) -> subprocess.Popen[bytes]:
-    process = subprocess.Popen(
-        [sys.executable, "-c", _CLIENT, one.endpoint], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    )
-    assert process.stdout is not None
-    assert process.stdout.readline() == b"asked\n"
+def ask_and_wait(one: DaemonProcess) -> LineProcess:
+    process = LineProcess(sys.executable, "-c", _CLIENT, one.endpoint)
+    assert process.read() == "asked"
     return process
 
 
-def test_clients_that_die_are_forgotten(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
-) -> None:
+def test_clients_that_die_are_forgotten(served: DaemonProcess, client: RawClient) -> None:
     """Sessions end with their process, not with a timer; a stopped one is still there."""
-    one = daemon(divided_map.root)
-    client = connect(one)
     client.area(circle(0, 0, 500))
-    before = descriptors(one.pid)
-    dying = [ask_and_wait(one) for _ in range(4)]
+    before = descriptors(served.pid)
+    dying = [ask_and_wait(served) for _ in range(4)]
     os.kill(dying[0].pid, signal.SIGSTOP)
     assert len(client.ask("stats")[5]) == 5
     for process in dying[1:]:
         process.kill()
-        process.communicate()
-    waiting = Deadline()
-    while waiting(len(client.ask("stats")[5]) > 2):
-        pass
+    until(lambda: len(client.ask("stats")[5]) <= 2)
     for _ in range(20):
         assert len(client.ask("stats")[5]) == 2  # the stopped one is not reaped
     dying[0].kill()
-    dying[0].communicate()
-    waiting = Deadline()
-    while waiting(len(client.ask("stats")[5]) > 1):
-        pass
-    waiting = Deadline()
-    while waiting(descriptors(one.pid) > before):
-        client.ask("stats")
+    until(lambda: len(client.ask("stats")[5]) <= 1)
+    until(lambda: descriptors(served.pid) <= before)
 
 
 def test_sessions_come_and_go_without_a_trace(
@@ -197,28 +167,13 @@ def test_sessions_come_and_go_without_a_trace(
             client.ask("evict")
             if number % 4 == 0:
                 client.ask("reload")
-        waiting = Deadline()
-        while waiting(bool(one.segments()) or len(client.ask("stats")[5]) > 1):
-            client.ask("stats")
+        until(lambda: not one.segments() and len(client.ask("stats")[5]) <= 1)
 
     busy()
     before, loaders = descriptors(one.pid), one.children()
     busy()
-    waiting = Deadline()
-    while waiting(descriptors(one.pid) > before):
-        client.ask("stats")
+    until(lambda: descriptors(one.pid) <= before)
     assert one.children() == loaders
-
-
-def test_poses_that_are_not_finite(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
-    """Refused, and no client's cells are lost in the queue for it."""
-    client = connect(daemon(divided_map.root))
-    nan, inf = float("nan"), float("inf")
-    for intent in ([nan, 0.0], [0.0, inf], [0.0, 0.0, nan], [0.0, 0.0, 0.0, 0.0, inf, [[0.0, nan]]]):
-        with pytest.raises(DaemonError) as failure:
-            client.area(circle(0, 0, 5), intent=intent)
-        assert failure.value.code == "bad_request"
-    assert len(client.area(circle(0, 0, 5)).cells) == 4
 
 
 # --- clients that take all descriptors or memory: they lose their connections, others notice nothing -
@@ -253,26 +208,9 @@ def done(word="done"):
 """
 
 
-@contextmanager
-def hostile(one: DaemonProcess, program: str) -> Iterator[subprocess.Popen[str]]:
+def hostile(one: DaemonProcess, program: str) -> LineProcess:
     """Run a hostile program until it says that it is done; it then stays as it is."""
-    process = subprocess.Popen(
-        [sys.executable, "-c", _PRELUDE + program, one.endpoint],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-        cwd=ROOT,
-    )
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
-
-
-def said(process: subprocess.Popen[str]) -> str:
-    assert process.stdout is not None
-    return process.stdout.readline().strip()
+    return LineProcess(sys.executable, "-c", _PRELUDE + program, one.endpoint)
 
 
 def serves(client: RawClient) -> None:
@@ -314,23 +252,17 @@ def test_more_connections_than_descriptors(
     client = connect(one)
     serves(client)
     with hostile(one, CROWDS[crowd]) as process:
-        assert said(process) == "done"
+        assert process.read() == "done"
         serves(client)
         assert descriptors(one.pid) < LIMIT
         serves(connect(one))
         assert f"connections ended pid={process.pid} count=" in one.log
         serves(client)
-    waiting = Deadline()
-    while waiting(descriptors(one.pid) > LIMIT // 2):
-        client.ask("stats")
+    until(lambda: descriptors(one.pid) <= LIMIT // 2)
 
 
-def test_more_sessions_than_there_may_be(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
-) -> None:
+def test_more_sessions_than_there_may_be(served: DaemonProcess, client: RawClient, connect: Connect) -> None:
     """One process opens session after session on new connections: it displaces its own."""
-    one = daemon(divided_map.root)
-    client = connect(one)
     serves(client)
     program = """
 context = zmq.Context()
@@ -343,23 +275,17 @@ for number in range(4200):
     one.close()
 done()
 """
-    with hostile(one, program) as process:
-        assert said(process) == "done"
+    with hostile(served, program) as process:
+        assert process.read() == "done"
         serves(client)
-        serves(connect(one))
-        assert "sessions already" not in one.log
-    waiting = Deadline()
-    while waiting(len(client.ask("stats")[5]) > 2):
-        pass
+        serves(connect(served))
+        assert "sessions already" not in served.log
+    until(lambda: len(client.ask("stats")[5]) <= 2)
 
 
-def test_replies_that_are_never_read(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
-) -> None:
-    one = daemon(divided_map.root)
-    client = connect(one)
+def test_replies_that_are_never_read(served: DaemonProcess, client: RawClient) -> None:
     client.area(circle(0, 0, 500))
-    before = resident_bytes(one.pid)
+    before = resident_bytes(served.pid)
     program = """
 one = zmtp()
 one.settimeout(20.0)
@@ -374,17 +300,15 @@ try:
 except OSError:
     done("ended")
 """
-    with hostile(one, program) as process:
-        assert said(process) == "ended"
+    with hostile(served, program) as process:
+        assert process.read() == "ended"
         serves(client)
-        assert f'connections ended pid={process.pid} count=1 reason="it left' in one.log
-    assert resident_bytes(one.pid) - before < 96 << 20
+        assert f'connections ended pid={process.pid} count=1 reason="it left' in served.log
+    assert resident_bytes(served.pid) - before < 96 << 20
 
 
-def test_a_message_that_never_ends(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
+def test_a_message_that_never_ends(served: DaemonProcess, client: RawClient) -> None:
     """Frame after frame, each small enough: libzmq keeps them all until the last one comes."""
-    one = daemon(divided_map.root)
-    client = connect(one)
     serves(client)
     program = """
 one = zmtp()
@@ -396,25 +320,19 @@ try:
 except OSError:
     done("ended")
 """
-    with hostile(one, program) as process:
-        assert said(process) == "ended"
+    with hostile(served, program) as process:
+        assert process.read() == "ended"
         serves(client)
-        assert f"connections ended pid={process.pid} count=" in one.log
-        assert "it made the daemon take too much memory" in one.log
-    waiting = Deadline()
-    while waiting(resident_bytes(one.pid) > 400 << 20):
-        client.ask("stats")
+        assert f"connections ended pid={process.pid} count=" in served.log
+        assert "it made the daemon take too much memory" in served.log
+    until(lambda: resident_bytes(served.pid) <= 400 << 20)
 
 
-def test_a_process_that_asks_too_much_at_once(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
-) -> None:
+def test_a_process_that_asks_too_much_at_once(served: DaemonProcess, client: RawClient) -> None:
     """What waits beyond the limit is refused; the refusal says so, and later requests are served.
 
     All replies together are fewer, and less, than what the daemon keeps for a client that does not read.
     """
-    one = daemon(divided_map.root)
-    client = connect(one)
     serves(client)
     body = [client.send("selected", ["0_0.pcd"] * 500, ["points"], None) for _ in range(200)]
     kinds = [client.receive() for _ in body]
@@ -460,33 +378,10 @@ sys.stdin.read()
 """
 
 
-@contextmanager
-def member_with_locks(one: DaemonProcess) -> Iterator[dict[str, Any]]:
-    """Run the member; gives what it got."""
-    process = subprocess.Popen(
-        [
-            "setpriv",
-            f"--reuid={MEMBER}",
-            f"--regid={GROUP}",
-            "--clear-groups",
-            "--inh-caps=-all",
-            python_for_others(),
-            "-I",
-            "-c",
-            _LOCKS,
-            one.shm_dir,
-            one.runtime_dir,
-        ],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        cwd="/",
-    )
-    try:
-        assert process.stdout is not None
-        yield json.loads(process.stdout.readline())
-    finally:
-        process.kill()
-        process.communicate()
+def member_with_locks(one: DaemonProcess) -> LineProcess:
+    """Run the member; it prints what it got."""
+    account = ["setpriv", f"--reuid={MEMBER}", f"--regid={GROUP}", "--clear-groups", "--inh-caps=-all"]
+    return LineProcess(*account, python_for_others(), "-I", "-c", _LOCKS, one.shm_dir, one.runtime_dir)
 
 
 @pytest.mark.root
@@ -497,7 +392,8 @@ def test_locks_hold_up_no_client(daemon: DaemonFactory, connect: Connect, divide
     one.start()
     client = connect(one)
     assert len(client.area(circle(0, 0, 500)).cells) == 36
-    with member_with_locks(one) as found:
+    with member_with_locks(one) as member:
+        found = json.loads(member.read())
         assert found["locked"] == 36 + 1  # the segments and the statistics; no lock file of the daemon's
         # of the statistics the daemon has a lock itself
         assert found["refused"] == ["lease", "open lock", "read lock of statistics", "write lock"]

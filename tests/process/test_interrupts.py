@@ -32,10 +32,8 @@ from shmmap.client import connection_watch
 from shmmap.client.connection_watch import running, start_thread
 from shmmap.client.window import follower
 from shmmap.errors import BadRequest
-from tests.support.daemon_process import DaemonProcess, Deadline
-from tests.support.divided_map import DividedMap
+from tests.support.daemon_process import DaemonProcess, until
 
-Factory = Callable[..., DaemonProcess]
 LONG_S = 60.0
 
 _libc = ctypes.CDLL(None)
@@ -99,9 +97,7 @@ def threads() -> set[str]:
 
 def await_end_of_threads(known: set[str]) -> None:
     """Wait until there is no thread but these: one that has said that it is over still has to end."""
-    waiting = Deadline()
-    while waiting(not threads() <= known):
-        time.sleep(0.001)
+    until(lambda: threads() <= known)
 
 
 def holdings(one: DaemonProcess) -> tuple[int, int, int]:
@@ -130,30 +126,28 @@ def interrupted_everywhere(work: Callable[[], object], check: Callable[[int], No
     return number
 
 
-def test_a_request_that_attaches(daemon: Factory, divided_map: DividedMap) -> None:
+def test_a_request_that_attaches(standing: DaemonProcess) -> None:
     """Nothing stays open or mapped, the next request is answered, and answered rightly."""
-    one = daemon(divided_map.root)
-    with shmmap.connect(one.endpoint, timeout=LONG_S) as client:
+    with shmmap.connect(standing.endpoint, timeout=LONG_S) as client:
         expected = {cell.version for cell in client.around(10, 10, 1, wait=LONG_S)}
         assert len(expected) == 1
         client.release()
-        before = holdings(one)
+        before = holdings(standing)
 
         def check(number: int) -> None:
             assert not client.session._lock.locked(), number
             if number % 8 == 0:
-                assert holdings(one) == before, number
+                assert holdings(standing) == before, number
             assert {cell.version for cell in client.around(10, 10, 1)} == expected, number
 
         places = interrupted_everywhere(lambda: client.around(10, 10, 1), check)
         assert places > 100, "is anything traced?"
-        assert holdings(one) == before
+        assert holdings(standing) == before
         assert client.release() == 1
 
 
-def test_what_a_window_does_in_the_calling_thread(daemon: Factory, divided_map: DividedMap) -> None:
-    one = daemon(divided_map.root)
-    with shmmap.connect(one.endpoint, timeout=LONG_S) as client, shmmap.MapWindow(client, 15) as window:
+def test_what_a_window_does_in_the_calling_thread(standing: DaemonProcess) -> None:
+    with shmmap.connect(standing.endpoint, timeout=LONG_S) as client, shmmap.MapWindow(client, 15) as window:
         window.move_to(0, 0, wait=LONG_S)
         places = [5.0, 0.0]
 
@@ -167,17 +161,16 @@ def test_what_a_window_does_in_the_calling_thread(daemon: Factory, divided_map: 
         assert interrupted_everywhere(move, check) > 30
 
 
-def test_closing(daemon: Factory, divided_map: DividedMap) -> None:
+def test_closing(standing: DaemonProcess) -> None:
     """A close that was interrupted can be repeated, and the next connection ends what was left."""
-    one = daemon(divided_map.root)
     known = threads()
-    shmmap.connect(one.endpoint).close()
+    shmmap.connect(standing.endpoint).close()
     await_end_of_threads(known)
-    before = holdings(one)
+    before = holdings(standing)
     number, done = 0, False
     while not done:
         number += 1
-        client = shmmap.connect(one.endpoint, timeout=LONG_S)
+        client = shmmap.connect(standing.endpoint, timeout=LONG_S)
         place = AtPlace(number)
         try:
             sys.settrace(place)
@@ -190,9 +183,9 @@ def test_closing(daemon: Factory, divided_map: DividedMap) -> None:
         client.close()
         del client
         if number % 8 == 0 or done:
-            shmmap.connect(one.endpoint).close()
+            shmmap.connect(standing.endpoint).close()
             await_end_of_threads(known)
-            assert holdings(one) == before, number
+            assert holdings(standing) == before, number
     assert number > 20
 
 
@@ -213,18 +206,16 @@ def leaves_nothing(one: DaemonProcess, work: Callable[[], object]) -> Callable[[
     return check
 
 
-def test_connecting(daemon: Factory, divided_map: DividedMap) -> None:
-    one = daemon(divided_map.root)
-    check = leaves_nothing(one, lambda: shmmap.connect(one.endpoint).close())
-    assert interrupted_everywhere(lambda: shmmap.connect(one.endpoint, name="x").close(), check) > 100
+def test_connecting(standing: DaemonProcess) -> None:
+    check = leaves_nothing(standing, lambda: shmmap.connect(standing.endpoint).close())
+    assert interrupted_everywhere(lambda: shmmap.connect(standing.endpoint, name="x").close(), check) > 100
 
 
-def test_following_events(daemon: Factory, divided_map: DividedMap) -> None:
-    one = daemon(divided_map.root)
-    check = leaves_nothing(one, lambda: shmmap.events.EventStream(one.endpoint).close())
+def test_following_events(standing: DaemonProcess) -> None:
+    check = leaves_nothing(standing, lambda: shmmap.events.EventStream(standing.endpoint).close())
 
     def follow() -> None:
-        shmmap.events.EventStream(one.endpoint, name="x", timeout=LONG_S).close()
+        shmmap.events.EventStream(standing.endpoint, name="x", timeout=LONG_S).close()
 
     assert interrupted_everywhere(follow, check) > 100
 
@@ -238,10 +229,9 @@ OPENS: dict[str, Callable[[str], Any]] = {
 
 @pytest.mark.parametrize("what", OPENS)
 def test_threads_that_begin_after_the_client_has_closed(
-    daemon: Factory, divided_map: DividedMap, monkeypatch: pytest.MonkeyPatch, what: str
+    standing: DaemonProcess, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
     """On a busy machine that may be after the next connection, and no other may come."""
-    one = daemon(divided_map.root)
     known = threads()
     begun: list[Callable[[], None]] = []
 
@@ -249,34 +239,33 @@ def test_threads_that_begin_after_the_client_has_closed(
         begun.append(partial(start_thread, run, *arguments))
         raise Interrupt
 
-    OPENS[what](one.endpoint).close()
+    OPENS[what](standing.endpoint).close()
     await_end_of_threads(known)
-    before = holdings(one), len(running)
+    before = holdings(standing), len(running)
     with monkeypatch.context() as patch:
         patch.setattr(follower if what == "window" else connection_watch, "start_thread", later)
         with contextlib.suppress(Interrupt):
-            OPENS[what](one.endpoint)
-    shmmap.connect(one.endpoint).close()
+            OPENS[what](standing.endpoint)
+    shmmap.connect(standing.endpoint).close()
     (begin,) = begun
     begin()
     await_end_of_threads(known)
-    assert (holdings(one), len(running)) == before
+    assert (holdings(standing), len(running)) == before
 
 
 # --- a signal that comes to another thread ------------------------------------------------------------
 
 
 @pytest.mark.parametrize("what", ["client", "events"])
-def test_a_signal_while_libzmq_ends(daemon: Factory, divided_map: DividedMap, what: str) -> None:
+def test_a_signal_while_libzmq_ends(standing: DaemonProcess, what: str) -> None:
     """The kernel may choose any thread for it; where it interrupts the end, half of a context stays."""
-    one = daemon(divided_map.root)
     socket: zmq.Socket[bytes]
 
     def made() -> tuple[Callable[[], None], zmq.Socket[bytes]]:
         if what == "events":
-            stream = shmmap.events.EventStream(one.endpoint, timeout=LONG_S)
+            stream = shmmap.events.EventStream(standing.endpoint, timeout=LONG_S)
             return stream.close, stream._socket
-        client = shmmap.connect(one.endpoint, timeout=LONG_S)
+        client = shmmap.connect(standing.endpoint, timeout=LONG_S)
         connection = client.session._connection
         assert connection is not None
         return client.close, connection._socket
@@ -284,7 +273,7 @@ def test_a_signal_while_libzmq_ends(daemon: Factory, divided_map: DividedMap, wh
     known = threads()
     made()[0]()
     await_end_of_threads(known)
-    before = holdings(one)
+    before = holdings(standing)
     close, socket = made()
     hold_up = socket.context.socket(zmq.PAIR)  # the context ends when the last socket of it is closed
     closing = threading.Thread(target=close)
@@ -306,20 +295,17 @@ def test_a_signal_while_libzmq_ends(daemon: Factory, divided_map: DividedMap, wh
         signal.signal(signal.SIGUSR1, handled)
     del close, socket, hold_up, closing
     await_end_of_threads(known)
-    assert holdings(one) == before
+    assert holdings(standing) == before
 
 
 # --- a client used in a handler -----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("use", ["ask", "close"])
-def test_a_client_in_a_handler_that_interrupted_it(
-    daemon: Factory, divided_map: DividedMap, use: str
-) -> None:
+def test_a_client_in_a_handler_that_interrupted_it(standing: DaemonProcess, use: str) -> None:
     """It says so at once, and the request that was interrupted goes on."""
-    one = daemon(divided_map.root)
     seen: list[BadRequest] = []
-    with shmmap.connect(one.endpoint, timeout=LONG_S) as client:
+    with shmmap.connect(standing.endpoint, timeout=LONG_S) as client:
         client.around(0, 0, 30, wait=LONG_S)
         waiting = threading.Event()
 
@@ -328,11 +314,11 @@ def test_a_client_in_a_handler_that_interrupted_it(
             with pytest.raises(BadRequest, match="signal handler") as raised:
                 client.stats() if use == "ask" else client.close()
             seen.append(raised.value)
-            one.send(signal.SIGCONT)
+            standing.send(signal.SIGCONT)
 
         before = signal.signal(signal.SIGUSR1, handle)
         try:
-            one.send(signal.SIGSTOP)
+            standing.send(signal.SIGSTOP)
 
             def interrupt() -> None:
                 while not client.session._lock.locked():
@@ -345,17 +331,16 @@ def test_a_client_in_a_handler_that_interrupted_it(
             assert client.around(0, 0, 30, wait=LONG_S).complete
             thread.join()
         finally:
-            one.send(signal.SIGCONT)
+            standing.send(signal.SIGCONT)
             signal.signal(signal.SIGUSR1, before)
         assert waiting.is_set()
         assert "flag" in seen[0].hint
         assert client.stats().epoch == client.epoch
 
 
-def test_a_handler_may_use_the_client_between_requests(daemon: Factory, divided_map: DividedMap) -> None:
-    one = daemon(divided_map.root)
+def test_a_handler_may_use_the_client_between_requests(standing: DaemonProcess) -> None:
     answers = []
-    with shmmap.connect(one.endpoint, timeout=LONG_S) as client:
+    with shmmap.connect(standing.endpoint, timeout=LONG_S) as client:
         before = signal.signal(signal.SIGUSR1, lambda *_: answers.append(client.stats()))
         try:
             signal.raise_signal(signal.SIGUSR1)

@@ -286,7 +286,7 @@ def test_a_life_against_the_oracle(
     rare = [life.crash, life.crash, life.restart, life.end]
     try:
         for number in range(STEPS):
-            if number == 9 * STEPS // 10:  # from here on all are starved of processors
+            if number == 19 * STEPS // 20:  # from here on all are starved of processors
                 overload += [
                     subprocess.Popen([sys.executable, "-c", "while True: pass"])
                     for _ in range(2 * len(os.sched_getaffinity(0)))

@@ -9,7 +9,6 @@ import os
 import signal
 import socket
 import stat
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -20,37 +19,29 @@ import shmmap
 from shmmap.protocol.rows import CellRow
 from shmmap.statistics.reader import read_statistics
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import DaemonProcess, Deadline, wait_ended
+from tests.support.daemon_process import DaemonProcess, Deadline, first_answer, until
 from tests.support.divided_map import DividedMap, random_points
-from tests.support.mapping_process import MappingProcess
-from tests.support.raw_client import DaemonError, RawClient, circle
+from tests.support.raw_client import RawClient, circle
 
 Connect = Callable[..., RawClient]
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_ends_it_cleanly(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap, number: signal.Signals
-) -> None:
-    one = daemon(divided_map.root)
-    assert len(connect(one).area(circle(0, 0, 60)).cells) > 20
-    assert len(one.segments()) > 20
-    assert one.process is not None
-    process, one.process = one.process, None
+def test_a_signal_ends_it_cleanly(served: DaemonProcess, connect: Connect, number: signal.Signals) -> None:
+    assert len(connect(served).area(circle(0, 0, 60)).cells) > 20
+    assert len(served.segments()) > 20
+    assert served.process is not None
+    process, served.process = served.process, None
     process.send_signal(number)
     assert process.wait(30) == 0
-    assert one.leftovers() == []
+    assert served.leftovers() == []
 
 
-def test_a_signal_while_cells_load_and_clients_wait(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
-) -> None:
-    one = daemon(divided_map.root)
-    client = connect(one)
+def test_a_signal_while_cells_load_and_clients_wait(served: DaemonProcess, client: RawClient) -> None:
     request = client.send("area", circle(0, 0, 500), ["points"], 60.0)
     client.ask("stats")  # the request before it was taken
-    assert one.stop() == 0
-    assert one.leftovers() == []
+    assert served.stop() == 0
+    assert served.leftovers() == []
     reply = client.cells_reply(client.wait_for(request))  # a waiting client gets what there is
     assert len(reply.cells) + len(reply.pending) == 36
 
@@ -74,7 +65,7 @@ def test_signals_one_after_the_other_end_it_at_once(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
 ) -> None:
     """Whatever the first one's work has come to when the others arrive."""
-    for _ in range(5):
+    for _ in range(3):
         one = daemon(divided_map.root)
         client = connect(one)
         client.area(circle(0, 0, 60))
@@ -88,14 +79,12 @@ def test_signals_one_after_the_other_end_it_at_once(
         assert [name for name in os.listdir(one.runtime_dir) if name.endswith(".lock")] == []
 
 
-def test_a_burst_of_reload_signals(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
-    one = daemon(divided_map.root)
-    client = connect(one)
+def test_a_burst_of_reload_signals(served: DaemonProcess, client: RawClient, divided_map: DividedMap) -> None:
     before = client.selected(["0_0.pcd"]).cells[0]
     corner = divided_map.corners["0_0.pcd"]
     divided_map.write_cell("0_0.pcd", corner, random_points(np.random.default_rng(4), corner, 40))
     for _ in range(200):
-        one.send(signal.SIGHUP)
+        served.send(signal.SIGHUP)
     reply = client.selected(["0_0.pcd"])
     while reply.cells[0].version == before.version:
         reply = client.selected(["0_0.pcd"])
@@ -105,28 +94,27 @@ def test_a_burst_of_reload_signals(daemon: DaemonFactory, connect: Connect, divi
 
 
 def test_a_second_instance_is_refused_and_the_first_one_goes_on(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+    served: DaemonProcess, client: RawClient, connect: Connect
 ) -> None:
-    one = daemon(divided_map.root)
-    client = connect(one)
-    assert one.run_to_end() == 75
+    assert served.run_to_end() == 75
     assert len(client.area(circle(0, 0, 5)).cells) == 4
-    assert len(connect(one).area(circle(0, 0, 5)).cells) == 4  # the socket was not stolen
+    assert len(connect(served).area(circle(0, 0, 5)).cells) == 4  # the socket was not stolen
 
 
-def test_two_instances_side_by_side(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
-    one = daemon(divided_map.root)
-    first = one.log.splitlines()[0]
+def test_two_instances_side_by_side(
+    served: DaemonProcess, daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    first = served.log.splitlines()[0]
     assert (
-        f"INFO    starting version={shmmap.__version__} instance={one.instance} map={divided_map.root} "
+        f"INFO    starting version={shmmap.__version__} instance={served.instance} map={divided_map.root} "
         in first
     )
-    two = daemon(divided_map.root, shm_dir=one.shm_dir)
-    assert len(connect(one).area(circle(0, 0, 5)).cells) == 4
+    two = daemon(divided_map.root, shm_dir=served.shm_dir)
+    assert len(connect(served).area(circle(0, 0, 5)).cells) == 4
     assert len(connect(two).area(circle(0, 0, 25)).cells) == 12
-    assert (len(one.segments()), len(two.segments())) == (4, 12)
+    assert (len(served.segments()), len(two.segments())) == (4, 12)
     assert two.stop() == 0
-    assert (len(one.segments()), len(two.segments())) == (4, 0)
+    assert (len(served.segments()), len(two.segments())) == (4, 0)
 
 
 @pytest.mark.parametrize(
@@ -155,70 +143,41 @@ def test_bad_settings(daemon: DaemonFactory, divided_map: DividedMap, flags: tup
     assert one.leftovers() == []
 
 
-def test_killed_and_started_again(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
-    """What was mapped stays readable; the session is new, the versions are the same."""
-    one = daemon(divided_map.root)
-    client = connect(one)
-    first = client.area(circle(0, 0, 25))
-    path = client.path(first.cells[0])
-    expected = zlib.crc32(Path(path).read_bytes())
-    with MappingProcess([path]) as reader:
-        one.kill()
-        assert [pid for pid in one.children() if not wait_ended(pid, 10.0)] == []  # workers do not outlive it
-        assert reader.checksums() == [expected]
-        one.start()
-        with pytest.raises(DaemonError) as failure:
-            client.area(circle(0, 0, 25))
-        assert failure.value.code == "no_session"
-        epoch = client.epoch
-        client.hello()
-        assert client.epoch != epoch
-        second = client.area(circle(0, 0, 25))
-        assert [(h.id, h.version) for h in second.cells] == [(h.id, h.version) for h in first.cells]
-        held = client.differential(circle(0, 0, 25), packed=[h.version for h in first.cells])
-        assert (held.cells, held.removed_versions) == ([], [])
-        assert reader.checksums() == [expected]
-
-
-def test_what_the_statistics_have(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
-    one = daemon(divided_map.root)
-    seen = read_statistics(one.instance, one.shm_dir)
+def test_what_the_statistics_have(served: DaemonProcess, connect: Connect, divided_map: DividedMap) -> None:
+    seen = read_statistics(served.instance, served.shm_dir)
     assert seen.state == "healthy"
     assert seen.identity is not None
-    assert (seen.identity.pid, seen.identity.endpoint) == (one.pid, one.endpoint)
+    assert (seen.identity.pid, seen.identity.endpoint) == (served.pid, served.endpoint)
     assert seen.counters["map_cells"] in (0, 36)  # the first beat may still come
-    client = connect(one)
+    client = connect(served)
     client.area(circle(0, 0, 25))
-    one.send(signal.SIGSTOP)
-    os.waitid(os.P_PID, one.pid, os.WSTOPPED | os.WNOWAIT)
-    assert read_statistics(one.instance, one.shm_dir).state == "stopped"
-    one.send(signal.SIGCONT)
-    waiting = Deadline()
-    while waiting(len((seen := read_statistics(one.instance, one.shm_dir)).cells) < 12):
-        client.ask("stats")  # their rows follow when clients have been answered
+    served.send(signal.SIGSTOP)
+    os.waitid(os.P_PID, served.pid, os.WSTOPPED | os.WNOWAIT)
+    assert read_statistics(served.instance, served.shm_dir).state == "stopped"
+    served.send(signal.SIGCONT)
+    # their rows follow when clients have been answered
+    seen = first_answer(
+        lambda: read_statistics(served.instance, served.shm_dir), lambda found: len(found.cells) >= 12
+    )
     assert [cell.id for cell in seen.cells] == sorted(divided_map.in_circle(0, 0, 25))
     assert {cell.state for cell in seen.cells} == {"resident"}
-    assert sum(cell.bytes for cell in seen.cells) == seen.counters["bytes_resident"] == one.segment_bytes()
+    assert sum(cell.bytes for cell in seen.cells) == seen.counters["bytes_resident"] == served.segment_bytes()
     before = {cell.id: cell for cell in seen.cells}
     for _ in range(3):
         client.selected(["0_0.pcd"])
-    waiting = Deadline()
-    while waiting(read_statistics(one.instance, one.shm_dir).counters["handles_sent"] < 15):
-        client.ask("stats")
-    waiting = Deadline()
-    while waiting(_row(one, "0_0.pcd").hits < before["0_0.pcd"].hits + 3):
-        client.ask("stats")
-    assert _row(one, "0_0.pcd").last_use_monotonic_ns > before["0_0.pcd"].last_use_monotonic_ns
-    one.kill()
-    assert read_statistics(one.instance, one.shm_dir).state == "dead"
-    one.start()
-    again = read_statistics(one.instance, one.shm_dir)
+    until(lambda: read_statistics(served.instance, served.shm_dir).counters["handles_sent"] >= 15)
+    until(lambda: _row(served, "0_0.pcd").hits >= before["0_0.pcd"].hits + 3)
+    assert _row(served, "0_0.pcd").last_use_monotonic_ns > before["0_0.pcd"].last_use_monotonic_ns
+    served.kill()
+    assert read_statistics(served.instance, served.shm_dir).state == "dead"
+    served.start()
+    again = read_statistics(served.instance, served.shm_dir)
     assert again.identity is not None
     assert again.state == "healthy"
     assert seen.identity is not None
     assert again.identity.epoch != seen.identity.epoch
-    assert one.stop() == 0
-    assert read_statistics(one.instance, one.shm_dir).state == "absent"
+    assert served.stop() == 0
+    assert read_statistics(served.instance, served.shm_dir).state == "absent"
 
 
 def _row(one: DaemonProcess, name: str) -> CellRow:
@@ -226,29 +185,22 @@ def _row(one: DaemonProcess, name: str) -> CellRow:
     return next(c for c in read_statistics(one.instance, one.shm_dir).cells if c.id == name)
 
 
-def test_nothing_is_open_to_others_without_a_group(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
-) -> None:
-    one = daemon(divided_map.root)
-    connect(one).area(circle(0, 0, 5))
-    for name in one.segments():
-        assert stat.S_IMODE(os.stat(f"{one.shm_dir}/{name}").st_mode) == 0o400
-    assert stat.S_IMODE(os.stat(f"{one.shm_dir}/shmmap.{one.instance}.statistics").st_mode) == 0o400
-    assert stat.S_IMODE(os.stat(one.endpoint).st_mode) & 0o077 == 0
+def test_nothing_is_open_to_others_without_a_group(served: DaemonProcess, connect: Connect) -> None:
+    connect(served).area(circle(0, 0, 5))
+    for name in served.segments():
+        assert stat.S_IMODE(os.stat(f"{served.shm_dir}/{name}").st_mode) == 0o400
+    assert stat.S_IMODE(os.stat(f"{served.shm_dir}/shmmap.{served.instance}.statistics").st_mode) == 0o400
+    assert stat.S_IMODE(os.stat(served.endpoint).st_mode) & 0o077 == 0
 
 
-def test_the_daemon_keeps_no_segment_open(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
-) -> None:
+def test_the_daemon_keeps_no_segment_open(served: DaemonProcess, client: RawClient) -> None:
     """An open file of the daemon's own would look like a reader that never ends."""
-    one = daemon(divided_map.root)
-    client = connect(one)
     client.area(circle(0, 0, 60))
     client.ask("stats")
-    own = [os.path.basename(t) for t in _open_paths(one.pid) if t.startswith(one.shm_dir + "/")]
-    assert [name for name in own if name in one.segments()] == []
-    maps = Path(f"/proc/{one.pid}/maps").read_text()
-    assert not any(name in maps for name in one.segments())
+    own = [os.path.basename(t) for t in _open_paths(served.pid) if t.startswith(served.shm_dir + "/")]
+    assert [name for name in own if name in served.segments()] == []
+    maps = Path(f"/proc/{served.pid}/maps").read_text()
+    assert not any(name in maps for name in served.segments())
 
 
 def _open_paths(pid: int) -> list[str]:
@@ -304,19 +256,18 @@ def test_directories_are_named_from_where_the_daemon_was_started(
 
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/autogroup"), reason="this kernel has no autogroups")
-def test_loaders_weigh_less_than_the_daemon(daemon: DaemonFactory, divided_map: DividedMap) -> None:
+def test_loaders_weigh_less_than_the_daemon(served: DaemonProcess) -> None:
     """Against all others on the machine: their nice value alone counts only within their session.
 
     With each job a loader asks for it again: the kernel takes ten such changes a second, of all processes.
     """
-    one = daemon(divided_map.root)
 
     def weights(*pids: int) -> list[str]:
         return [Path(f"/proc/{pid}/autogroup").read_text().split()[-1] for pid in pids]
 
     leaves = (1.0 + 0.01 * number for number in itertools.count())
     waiting = Deadline()
-    with shmmap.connect(one.endpoint, shm_dir=one.shm_dir) as client:
-        while waiting("5" not in weights(*one.loaders())):
+    with shmmap.connect(served.endpoint, shm_dir=served.shm_dir) as client:
+        while waiting("5" not in weights(*served.loaders())):
             client.around(0, 0, 5, layers=f"voxel(leaf={next(leaves):.2f})", wait=60.0)
-    assert weights(one.pid) == ["0"]
+    assert weights(served.pid) == ["0"]

@@ -12,7 +12,6 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,12 +19,12 @@ import pytest
 import shmmap
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.prerequisites import access_of_segments
-from shmmap.errors import ConfigError, LimitReached
+from shmmap.errors import ConfigError
 from shmmap.segment.process_limits import check_files, check_threads
 from shmmap.statistics.reader import read_statistics
 from shmmap.testing.daemon_process import without_settings
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import ROOT, DaemonProcess, Deadline
+from tests.support.daemon_process import ROOT, DaemonProcess, LineProcess, first_answer, until
 from tests.support.divided_map import DividedMap, make_map, random_points
 from tests.support.raw_client import RawClient, circle
 
@@ -87,9 +86,7 @@ def test_a_segment_that_the_limit_on_files_forbids(daemon: Factory, divided_map:
         assert len(client.around(-40, -40, 5, wait=60)) == 4
         for pid in (one.pid, *one.children()):
             resource.prlimit(pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
-        waiting = Deadline()
-        while waiting(bool(cells.failed)):
-            cells = client.around(0, 0, 15, wait=60)
+        cells = first_answer(lambda: client.around(0, 0, 15, wait=60), lambda found: not found.failed)
         assert len(cells) == 4
 
 
@@ -103,15 +100,11 @@ def test_statistics_that_cannot_be_written_end_no_process(
     soft, hard = resource.prlimit(one.pid, resource.RLIMIT_FSIZE)
     resource.prlimit(one.pid, resource.RLIMIT_FSIZE, (16384, hard))
     said = 'statistics not written error="File too large"'
-    waiting = Deadline()
-    while waiting(said not in one.log):
-        pass
+    until(lambda: said in one.log)
     asked = client.ask("stats")[4]["requests"]
     assert [handle.segment for handle in client.area(circle(0, 0, 5)).cells] == warm
     resource.prlimit(one.pid, resource.RLIMIT_FSIZE, (soft, hard))
-    waiting = Deadline()
-    while waiting(read_statistics(one.instance, one.shm_dir).counters["requests"] <= asked):
-        pass
+    until(lambda: read_statistics(one.instance, one.shm_dir).counters["requests"] > asked)
     assert one.log.count(said) == 1
 
 
@@ -253,12 +246,7 @@ print(window.wait_until_current(60), tried(lambda: None if client.around(0, 0, 5
 def test_none_to_connect_again_with(daemon: Factory, divided_map: DividedMap) -> None:
     """The daemon is back, and this process may not open a socket: the error does not blame the daemon."""
     one = daemon(divided_map.root)
-    program = subprocess.Popen(
-        [
-            sys.executable,
-            "-c",
-            PROGRAM
-            + """
+    code = """
 client = shmmap.connect(endpoint, timeout=1)
 print("connected", flush=True)
 while client.disconnected_since is None:
@@ -270,24 +258,18 @@ print(tried(lambda: client.around(0, 0, 50)), flush=True)
 free_files()
 client.close()
 print(tried(lambda: None if shmmap.connect(endpoint).around(0, 0, 50).complete else "no"), flush=True)
-""",
-            one.endpoint,
-        ],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-        cwd=ROOT,
-    )
-    assert program.stdout is not None
-    assert program.stdout.readline() == "connected\n"
-    one.stop()
-    assert program.stdout.readline() == "lost\n"
-    one.start()
-    rest, _ = program.communicate("\n", timeout=120)
-    refusal, after = rest.splitlines()
-    assert refusal.startswith("LimitReached: a connection to the daemon needs 1 more descriptors, 0 are left")
-    assert after == "works"
-    assert program.returncode == 0
+"""
+    with LineProcess(sys.executable, "-c", PROGRAM + code, one.endpoint) as program:
+        assert program.read() == "connected"
+        one.stop()
+        assert program.read() == "lost"
+        one.start()
+        program.write()
+        assert program.read().startswith(
+            "LimitReached: a connection to the daemon needs 1 more descriptors, 0 are left"
+        )
+        assert program.read() == "works"
+        assert program.process.wait(120) == 0
 
 
 @pytest.mark.parametrize("left", range(5))
@@ -346,11 +328,6 @@ def test_checking_leaves_nothing() -> None:
     assert set(os.listdir("/proc/self/task")) <= threads, "those of earlier tests may be ending"
 
 
-def test_the_error_is_one_of_ours() -> None:
-    assert shmmap.LimitReached is LimitReached
-    assert (LimitReached.code, LimitReached.exit_code) == ("limit_reached", 71)
-
-
 # --- what a client costs its process: descriptors, modules, memory -----------------------------------
 
 
@@ -382,20 +359,6 @@ sys.stdin.readline()
 """
 
 
-def run(program: str, *arguments: str) -> dict[str, Any]:
-    done = subprocess.run(
-        [sys.executable, "-c", program, *arguments],
-        capture_output=True,
-        text=True,
-        timeout=400,
-        check=False,
-        cwd=ROOT,
-    )
-    assert (done.returncode, done.stderr) == (0, "")
-    said: dict[str, Any] = json.loads(done.stdout)
-    return said
-
-
 def test_three_thousand_cells_with_a_thousand_descriptors(
     daemon: Factory, connect: Connect, tmp_path: Path
 ) -> None:
@@ -403,17 +366,8 @@ def test_three_thousand_cells_with_a_thousand_descriptors(
     made = make_map(tmp_path / "map", columns=60, rows=50, points=3)
     one = daemon(made.root, "--session-quota", "1")
     raw = connect(one)
-    holder = subprocess.Popen(
-        [sys.executable, "-c", MANY, one.endpoint],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-        cwd=ROOT,
-    )
-    assert holder.stdin is not None
-    assert holder.stdout is not None
-    try:
-        assert json.loads(holder.stdout.readline()) == {
+    with LineProcess(sys.executable, "-c", MANY, one.endpoint) as holder:
+        assert json.loads(holder.read()) == {
             "complete": True,
             "cells": 3000,
             "points": 9000,
@@ -422,22 +376,15 @@ def test_three_thousand_cells_with_a_thousand_descriptors(
             "mapped": 3000,
         }
         assert len(os.listdir(f"/proc/{one.pid}/fd")) < 64
-        waiting = Deadline()
-        while waiting(len(read_statistics(one.instance, one.shm_dir).cells) < 3000):
-            raw.ask("stats")
+        until(lambda: len(read_statistics(one.instance, one.shm_dir).cells) >= 3000)
         seen = read_statistics(one.instance, one.shm_dir)
         assert sorted(cell.id for cell in seen.cells) == sorted(made.corners)
         assert sum(cell.bytes for cell in seen.cells) == one.segment_bytes()
         assert raw.ask("evict")[2:4] == [0, 3000]
-        print(file=holder.stdin, flush=True)
-        assert json.loads(holder.stdout.readline()) == [0, 3000]
+        holder.write()
+        assert json.loads(holder.read()) == [0, 3000]
         one.until_segments(0, lambda: raw.ask("stats"))
-        waiting = Deadline()
-        while waiting(bool(read_statistics(one.instance, one.shm_dir).cells)):
-            raw.ask("stats")
-    finally:
-        holder.kill()
-        holder.communicate()
+        until(lambda: not read_statistics(one.instance, one.shm_dir).cells)
 
 
 COST = """
@@ -457,7 +404,7 @@ with shmmap.connect(sys.argv[1]) as client, shmmap.MapWindow(client, 30) as wind
 
 def test_a_client_loads_nothing_heavy_and_fits_40_megabytes(daemon: Factory, tmp_path: Path) -> None:
     one = daemon(make_map(tmp_path / "map", columns=2, rows=2).root)
-    said = run(COST, one.endpoint)
+    said = json.loads(outcomes(COST, one)[0])
     heavy = {"open3d", "numba", "scipy", "rich", "yaml", "xxhash", "lzf", "asyncio"}
     assert not heavy & set(said["modules"])
     assert said["megabytes"] < 40

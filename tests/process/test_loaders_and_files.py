@@ -18,18 +18,22 @@ import pytest
 
 from tests.process.conftest import DaemonFactory
 from tests.support.command_line import Shmmap
-from tests.support.daemon_process import DaemonProcess, Deadline, wait_ended
+from tests.support.daemon_process import DaemonProcess, first_answer, until, wait_ended
 from tests.support.divided_map import DividedMap, make_map, random_points
 from tests.support.process_costs import peak_bytes
-from tests.support.raw_client import RawClient, circle
+from tests.support.raw_client import RawCells, RawClient, circle
 from tests.support.segment_reader import assert_same_points, read_segment
 
 Connect = Callable[..., RawClient]
 
 
-def test_one_load_for_many_clients(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
-    one = daemon(divided_map.root)
-    clients = [connect(one) for _ in range(8)]
+def until_loaded(client: RawClient, x: float, y: float) -> RawCells:
+    """Ask for the four cells around a place until none fails: they are not tried again at once."""
+    return first_answer(lambda: client.area(circle(x, y, 5)), lambda reply: not reply.failed)
+
+
+def test_one_load_for_many_clients(served: DaemonProcess, connect: Connect, divided_map: DividedMap) -> None:
+    clients = [connect(served) for _ in range(8)]
     requests = [client.send("area", circle(0, 0, 60), ["points"], 30.0) for client in clients]
     wanted = divided_map.in_circle(0, 0, 60)
     replies = [c.cells_reply(c.wait_for(r)) for c, r in zip(clients, requests, strict=True)]
@@ -89,9 +93,7 @@ def ask_for_four(client: RawClient) -> int:
     """Ask for four cells, and wait until a loader, which stands still, has been given them."""
     started = client.ask("stats")[4]["loads_started"]
     request = client.send("area", circle(40, 40, 5), ["points"], 30.0)
-    waiting = Deadline()
-    while waiting(client.ask("stats")[4]["loads_started"] < started + 4):
-        pass
+    until(lambda: client.ask("stats")[4]["loads_started"] >= started + 4)
     return request
 
 
@@ -109,20 +111,13 @@ def test_a_loader_that_is_killed_costs_one_cell(
     (failure,) = reply.failed
     assert (failure.code, "SIGKILL" in failure.message) == ("load_failed", True)
     assert client.ask("stats")[4]["worker_crashes"] == 1
-    reply = client.area(circle(40, 40, 5))  # not tried again at once
-    waiting = Deadline()
-    while waiting(bool(reply.failed)):
-        reply = client.area(circle(40, 40, 5))
+    reply = until_loaded(client, 40, 40)
     assert len(reply.cells) == 4
 
 
-def test_idle_loaders_that_are_killed_are_replaced(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
-) -> None:
-    one = daemon(divided_map.root)
-    client = connect(one)
+def test_idle_loaders_that_are_killed_are_replaced(served: DaemonProcess, client: RawClient) -> None:
     client.area(circle(0, 0, 25))
-    for pid in one.loaders():
+    for pid in served.loaders():
         os.kill(pid, signal.SIGKILL)
         assert wait_ended(pid)
     reply = client.area(circle(0, 0, 200))
@@ -181,9 +176,7 @@ def test_a_file_that_is_cut_under_its_loader(
     for pid in one.children():
         with contextlib.suppress(ProcessLookupError):  # it may have ended with its parent
             os.kill(pid, signal.SIGKILL)
-    waiting = Deadline()
-    while waiting(bool(reply.failed)):
-        reply = client.area(circle(40, 40, 5))
+    reply = until_loaded(client, 40, 40)
     for handle in reply.cells:
         assert_same_points(client, handle, divided_map)
 
@@ -201,18 +194,15 @@ def test_no_descriptor_is_left_for_a_finished_segment(
     reply = client.area(circle(-40, -40, 5))
     assert len(reply.failed) + len(reply.cells) == 4
     resource.prlimit(one.pid, resource.RLIMIT_NOFILE, (hard, hard))
-    waiting = Deadline()
-    while waiting(bool(reply.failed)):
-        reply = client.area(circle(-40, -40, 5))
+    reply = until_loaded(client, -40, -40)
     for handle in reply.cells:
         assert_same_points(client, handle, divided_map)
 
 
 @pytest.mark.parametrize("kind", ["missing", "directory", "empty", "truncated", "loop", "unreadable length"])
 def test_a_bad_file_is_reported_and_retried_when_it_is_whole(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap, kind: str
+    served: DaemonProcess, connect: Connect, divided_map: DividedMap, kind: str
 ) -> None:
-    one = daemon(divided_map.root)
     path = divided_map.pcd_dir / "0_0.pcd"
     whole = path.read_bytes()
     path.unlink()
@@ -227,7 +217,7 @@ def test_a_bad_file_is_reported_and_retried_when_it_is_whole(
             "unreadable length": whole.replace(b"POINTS 500", b"POINTS 4000000000"),
         }
         path.write_bytes(content[kind])
-    client = connect(one)
+    client = connect(served)
     reply = client.area(circle(0, 0, 5))
     (failure,) = reply.failed
     assert (failure.id.rsplit("/", 1)[-1], failure.code) == ("0_0.pcd", "load_failed")
@@ -240,10 +230,7 @@ def test_a_bad_file_is_reported_and_retried_when_it_is_whole(
     interim = path.with_suffix(".new")
     interim.write_bytes(whole)
     interim.rename(path)
-    reply = client.area(circle(0, 0, 5))
-    waiting = Deadline()
-    while waiting(bool(reply.failed)):  # a file that could not even be looked at is tried again after a while
-        reply = client.area(circle(0, 0, 5))
+    reply = until_loaded(client, 0, 0)
     assert len(reply.cells) == 4
 
 
@@ -426,9 +413,7 @@ def test_the_daemon_goes_on(
     client.ask("release", None)
     from_now_on.touch()
     client.ask("evict", None)
-    waiting = Deadline()
-    while waiting(client.ask("stats")[4]["zombies"] > 0):
-        pass
+    until(lambda: client.ask("stats")[4]["zombies"] <= 0)
     assert len(client.area(circle(0, 0, 30)).cells) == len(loaded)
     assert client.ask("stats")[4]["defects"] == 3
     assert one.log.count(" ERROR   defect place=") == 1, "once in a while, not each time"

@@ -12,7 +12,7 @@ from shmmap import MapWindow
 from shmmap.errors import ShmmapError
 from tests.process.conftest import DaemonFactory
 from tests.support.command_line import Shmmap, publish
-from tests.support.daemon_process import ROOT, Deadline
+from tests.support.daemon_process import ROOT, Deadline, until
 from tests.support.divided_map import make_map
 
 TIMEOUT_S = 60.0
@@ -72,9 +72,7 @@ def test_python_tuf_is_never_imported_by_a_daemon(daemon: DaemonFactory, tmp_pat
         first = client.around(0, 0, radius=500, wait=TIMEOUT_S).map_version
         made.change("0_0.pcd", seed=7)
         publish(made.root, store, "--sign", str(keys))
-        waiting = Deadline()
-        while waiting(client.around(0, 0, radius=500, wait=TIMEOUT_S).map_version == first):
-            pass
+        until(lambda: client.around(0, 0, radius=500, wait=TIMEOUT_S).map_version != first)
         (store / "timestamp.json").unlink()
         with pytest.raises(ShmmapError):
             client.reload()

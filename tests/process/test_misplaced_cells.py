@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import json
-import os
 import warnings
 from pathlib import Path
 from typing import Any
@@ -15,25 +13,15 @@ import pytest
 import shmmap
 from shmmap import ShmmapWarning
 from tests.process.conftest import DaemonFactory
+from tests.support.command_line import Verbs, doctor, verb
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap, random_points
-from tests.support.forked_programs import run_verb
 
 MOVED = "0_0.pcd"
 
 
-def cli(one: DaemonProcess | None, *words: str | Path) -> tuple[int, str]:
-    place: tuple[str, ...] = ()
-    if one is not None:
-        place = ("--instance", one.instance, "--runtime-dir", one.runtime_dir, "--shm-dir", one.shm_dir)
-    environment = {k: v for k, v in os.environ.items() if not k.startswith("SHMMAP_")}
-    done = run_verb([*map(str, words), *place], environment)
-    return done.returncode, done.stdout + done.stderr
-
-
-def finding(one: DaemonProcess) -> dict[str, Any]:
-    report = json.loads(cli(one, "doctor", "--json")[1])
-    return next(finding for finding in report["findings"] if finding["name"] == "map")
+def finding(one: DaemonProcess) -> Any:
+    return doctor(one)[1]["map"]
 
 
 def move(made: DividedMap, name: str, by: float) -> None:
@@ -47,7 +35,9 @@ def count(client: shmmap.Client) -> int:
     return int(client.stats().counters["cells_outside_box"])
 
 
-def test_moved_cells_are_named_everywhere(daemon: DaemonFactory, divided_map: DividedMap) -> None:
+def test_moved_cells_are_named_everywhere(
+    daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path
+) -> None:
     move(divided_map, MOVED, 1000.0)
     one = daemon(divided_map.root)
     with shmmap.connect(one.endpoint) as client:
@@ -62,15 +52,14 @@ def test_moved_cells_are_named_everywhere(daemon: DaemonFactory, divided_map: Di
             client.around(0, 0, 30, layers=["voxel(leaf=2.0)"], wait=60)
         assert one.log.count("points outside the cell's box") == 1
         assert divided_map.id(MOVED) in one.log
-        assert "1 cell with points outside the cell's box" in cli(one, "status")[1]
+        assert "1 cell with points outside the cell's box" in verb(one, "status")[1]
         assert (finding(one)["state"], "points of 1 cell lie outside" in finding(one)["fact"]) == (
             "warn",
             True,
         )
-        code, said = cli(None, "inspect", divided_map.root)
-        assert code == 0
-        assert f"{MOVED} has points outside its box x 0 .. 20, y 0 .. 20" in said
-        report = json.loads(cli(None, "inspect", divided_map.root, "--json")[1])
+        said = f"{MOVED} has points outside its box x 0 .. 20, y 0 .. 20"
+        assert said in Verbs(tmp_path)("inspect", divided_map.root)
+        report = Verbs(tmp_path).json("inspect", divided_map.root)
         assert [Path(one["path"]).name for one in report["map"]["outside_box"]] == [MOVED]
         divided_map.change(MOVED, seed=5)  # the file is right again
         client.reload()
@@ -98,13 +87,12 @@ def test_known_after_a_warm_restart_and_gone_with_the_cell(
         assert count(client) == 0
 
 
-def test_a_sound_map_says_nothing(daemon: DaemonFactory, divided_map: DividedMap) -> None:
-    one = daemon(divided_map.root)
-    with shmmap.connect(one.endpoint) as client, warnings.catch_warnings():
+def test_a_sound_map_says_nothing(served: DaemonProcess, divided_map: DividedMap, tmp_path: Path) -> None:
+    with shmmap.connect(served.endpoint) as client, warnings.catch_warnings():
         warnings.simplefilter("error")
         assert len(client.around(0, 0, 100, wait=60).cells) == 36
         assert count(client) == 0
-    assert "outside" not in one.log
-    code, said = cli(one, "status")
+    assert "outside" not in served.log
+    code, said = verb(served, "status")
     assert (code, "outside" in said) == (0, False)
-    assert json.loads(cli(None, "inspect", divided_map.root, "--json")[1])["map"]["outside_box"] == []
+    assert Verbs(tmp_path).json("inspect", divided_map.root)["map"]["outside_box"] == []

@@ -12,7 +12,7 @@ import pytest
 from tests.process.conftest import DaemonFactory
 from tests.support.cloud_bytes import write_las
 from tests.support.command_line import Shmmap
-from tests.support.daemon_process import Deadline
+from tests.support.daemon_process import first_answer, until
 from tests.support.divided_map import DividedMap, make_map, read_pcd
 
 FAR = ("--circle", "9000,-70,5")
@@ -63,9 +63,7 @@ def test_what_is_empty_and_yet_an_answer(shmmap: Shmmap) -> None:
     names = [cell["id"] for cell in held]
     assert shmmap.json("query", "--circle", "0,0,5", "--held", *names)["cells"] == []
     assert shmmap("unpin", "--circle", "0,0,5") == "nothing is pinned\n"
-    waiting = Deadline()
-    while waiting(not shmmap.json("ls")["cells"]):  # the table is written a few times a second
-        pass
+    until(lambda: shmmap.json("ls")["cells"])  # the table is written a few times a second
     done = shmmap.run("ls", "--circle", "-50,-50,5")
     assert done.returncode == 1
     assert "no cell in memory within 5 m of (-50, -50); those in memory span x -20 .. 20 m" in done.stderr
@@ -151,16 +149,8 @@ def test_a_client_that_asks_for_more_than_its_part(daemon: DaemonFactory, tmp_pa
     assert len(lines) == 1, done.stdout
     assert "its quota of 1.0 MiB for itself alone [over_budget]" in lines[0]
     assert "0 bytes" not in done.stdout
-    (quota,) = [line for line in until(shmmap, "quota") if line.startswith("quota ")]
+    status = first_answer(lambda: shmmap("status"), lambda text: "\nquota " in text)
+    (quota,) = [line for line in status.splitlines() if line.startswith("quota ")]
     assert "a client asked for more than its part" in quota
-    (cache,) = [line for line in shmmap("status").splitlines() if line.startswith("cache ")]
+    (cache,) = [line for line in status.splitlines() if line.startswith("cache ")]
     assert cache.split(maxsplit=1)[1] == "large enough: nothing evicted for room, nothing refused"
-
-
-def until(shmmap: Shmmap, word: str) -> list[str]:
-    """Lines of `status`, once one begins with a word: the statistics follow a few times a second."""
-    waiting = Deadline()
-    lines: list[str] = []
-    while waiting(not any(line.startswith(word) for line in lines)):
-        lines = shmmap("status").splitlines()
-    return lines

@@ -13,7 +13,7 @@ import shmmap
 from shmmap.statistics.reader import read_statistics
 from tests.process.conftest import DaemonFactory
 from tests.support.command_line import publish
-from tests.support.daemon_process import DaemonProcess, Deadline, counters
+from tests.support.daemon_process import DaemonProcess, Deadline, counters, until
 from tests.support.divided_map import DividedMap, random_points
 from tests.support.web_servers import FaultyWeb, faulty_web
 
@@ -47,9 +47,7 @@ def in_memory(one: DaemonProcess) -> set[str]:
 
 
 def until_in_memory(one: DaemonProcess, *names: str) -> None:
-    waiting = Deadline()
-    while waiting(not set(names) <= in_memory(one)):
-        pass
+    until(lambda: set(names) <= in_memory(one))
 
 
 def drive(one: DaemonProcess, window: shmmap.MapWindow) -> None:
@@ -64,9 +62,7 @@ def drive(one: DaemonProcess, window: shmmap.MapWindow) -> None:
 
 
 def until_out(one: DaemonProcess) -> None:
-    waiting = Deadline()
-    while waiting(not counters(one)["origin_out"]):
-        pass
+    until(lambda: counters(one)["origin_out"])
 
 
 def test_cells_and_pages_along_the_route_are_in_memory(daemon: DaemonFactory, web: FaultyWeb) -> None:
@@ -96,10 +92,9 @@ def test_what_does_not_fit_in_memory_is_on_the_disk(daemon: DaemonFactory, web: 
     one = daemon(web.url, *words)
     with shmmap.MapWindow(one.endpoint, RADIUS) as window:
         assert window.move_to(1.0, 10.0, vx=SPEED, route=ROUTE, wait=TIMEOUT_S).complete
-        wanted, waiting = DRIVEN_M // SIZE + 1, Deadline()
-        cells = Path(one.cache_dir)
-        while waiting(sum(path.is_file() for path in cells.rglob("objects/cells/*/*")) < wanted):
-            pass
+        wanted, cells = DRIVEN_M // SIZE + 1, Path(one.cache_dir)
+        until(lambda: sum(path.is_file() for path in cells.rglob("objects/cells/*/*")) >= wanted)
+        waiting = Deadline()
         while waiting(not (counts := counters(one))["disk_ahead"] or counts["objects_fetched"] < wanted):
             window.move_to(1.0, 10.0, vx=SPEED, route=ROUTE)
         # the list of cells may have come out of order: then what is needed first takes the place of the rest

@@ -25,11 +25,10 @@ import pytest
 import shmmap
 from shmmap.client import handed_over
 from shmmap.errors import BadRequest, StaleHandle
-from tests.support.daemon_process import ROOT, DaemonProcess, Deadline
+from tests.support.daemon_process import ROOT, DaemonProcess, until
 from tests.support.pages import read_page
 from tests.support.process_costs import mappings_under
 
-Factory = Callable[..., DaemonProcess]
 METHODS = ("fork", "spawn", "forkserver")
 EXAMPLES = {
     "pool": r"32 cells, the highest point at \d+\.\d+ m",
@@ -117,9 +116,7 @@ def evicted(client: shmmap.Client) -> bytes:
     """Return a cell that was pickled, and dropped and evicted since."""
     data = pickle.dumps(client.selected("0_0.pcd", wait=60)[0])
     client.evict()
-    waiting = Deadline()
-    while waiting(attaches(data)):
-        pass
+    until(lambda: not attaches(data))
     return data
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import Deadline
+from tests.support.daemon_process import DaemonProcess, first_answer, until
 from tests.support.divided_map import DividedMap, random_points
 from tests.support.mapping_process import MappingProcess
 from tests.support.raw_client import DaemonError, RawClient, circle
@@ -20,10 +20,7 @@ from tests.support.segment_reader import assert_same_points, map_segment, names,
 Connect = Callable[..., RawClient]
 
 
-def test_changed_new_and_deleted_cells(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
-) -> None:
-    client = connect(daemon(divided_map.root))
+def test_changed_new_and_deleted_cells(client: RawClient, divided_map: DividedMap) -> None:
     first = client.area(circle(0, 0, 25))
     held = {handle.id.rsplit("/", 1)[1]: handle.version for handle in first.cells}
     divided_map.change("0_0.pcd", 5)
@@ -49,10 +46,7 @@ def test_changed_new_and_deleted_cells(
     assert [f.code for f in gone.failed] == ["unknown_cell"]
 
 
-def test_metadata_since_a_map_version(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
-) -> None:
-    client = connect(daemon(divided_map.root))
+def test_metadata_since_a_map_version(client: RawClient, divided_map: DividedMap) -> None:
     before = client.map_version
     nothing = client.ask("metadata", None, before)
     assert (nothing[4], nothing[6], nothing[7]) == ([], True, [])
@@ -75,17 +69,12 @@ def test_the_signal(daemon: DaemonFactory, connect: Connect, divided_map: Divide
     divided_map.change("0_0.pcd", 5)
     one.send(signal.SIGHUP)
     reply = client.selected(["0_0.pcd"])
-    waiting = Deadline()
-    while waiting(reply.map_version == old.map_version):
-        reply = client.selected(["0_0.pcd"])
+    reply = first_answer(lambda: client.selected(["0_0.pcd"]), lambda one: one.map_version != old.map_version)
     assert_same_points(client, reply.cells[0], divided_map)
 
 
-def test_a_file_rewritten_in_place_with_its_old_times(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
-) -> None:
+def test_a_file_rewritten_in_place_with_its_old_times(client: RawClient, divided_map: DividedMap) -> None:
     """Same size, same mtime: the change time shows it."""
-    client = connect(daemon(divided_map.root))
     old = client.selected(["0_0.pcd"]).cells[0]
     path = divided_map.pcd_dir / "0_0.pcd"
     status = path.stat()
@@ -101,9 +90,8 @@ def test_a_file_rewritten_in_place_with_its_old_times(
 
 
 def test_a_half_written_file_leaves_the_old_version_in_service(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+    client: RawClient, divided_map: DividedMap
 ) -> None:
-    client = connect(daemon(divided_map.root))
     old = client.selected(["0_0.pcd"]).cells[0]
     path = divided_map.pcd_dir / "0_0.pcd"
     whole = path.read_bytes()
@@ -124,10 +112,7 @@ def test_a_half_written_file_leaves_the_old_version_in_service(
     assert_same_points(client, reply.cells[0], divided_map)
 
 
-def test_a_broken_catalogue_changes_nothing(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
-) -> None:
-    client = connect(daemon(divided_map.root))
+def test_a_broken_catalogue_changes_nothing(client: RawClient, divided_map: DividedMap) -> None:
     path = divided_map.root / "pointcloud_map_metadata.yaml"
     text = path.read_text()
     for broken, code in (("x_resolution: [", "bad_map_data"), (None, ""), ("", "bad_map_data")):
@@ -145,10 +130,8 @@ def test_a_broken_catalogue_changes_nothing(
 
 
 def test_old_versions_stay_while_a_process_maps_them(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+    served: DaemonProcess, client: RawClient, divided_map: DividedMap
 ) -> None:
-    one = daemon(divided_map.root)
-    client = connect(one)
     old = client.selected(["0_0.pcd"]).cells[0]
     with MappingProcess([client.path(old)]) as reader:
         before = reader.checksums()
@@ -157,19 +140,16 @@ def test_old_versions_stay_while_a_process_maps_them(
         new = client.selected(["0_0.pcd"]).cells[0]
         assert new.segment != old.segment
         assert reader.checksums() == before
-        waiting = Deadline()
-        while waiting(not any(name.endswith(".zombie") for name in one.segments())):
-            client.ask("stats")
-        assert len(one.segments()) == 2
-    one.until_segments(1, lambda: client.ask("stats"))
+        until(lambda: any(name.endswith(".zombie") for name in served.segments()))
+        assert len(served.segments()) == 2
+    served.until_segments(1, lambda: client.ask("stats"))
 
 
 def test_reload_repeatedly_while_clients_ask(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+    served: DaemonProcess, connect: Connect, divided_map: DividedMap
 ) -> None:
     """Whatever a reply names is one whole state of its file, and the last one comes in the end."""
-    one = daemon(divided_map.root)
-    asker, changer = connect(one), connect(one)
+    asker, changer = connect(served), connect(served)
     states = {divided_map.points("0_0.pcd")["x"].tobytes()}
     for round_ in range(12):
         divided_map.change("0_0.pcd", round_, 200 + 10 * round_)
@@ -189,10 +169,7 @@ def test_reload_repeatedly_while_clients_ask(
     assert_same_points(asker, final, divided_map)
 
 
-def test_endless_metadata_changes_nothing(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
-) -> None:
-    client = connect(daemon(divided_map.root))
+def test_endless_metadata_changes_nothing(client: RawClient, divided_map: DividedMap) -> None:
     old = client.selected(["0_0.pcd"]).cells[0]
     metadata = divided_map.root / "pointcloud_map_metadata.yaml"
     good = metadata.read_text()

@@ -19,12 +19,11 @@ from tests.support.segment_reader import assert_same_points, names
 Connect = Callable[..., RawClient]
 
 
-def test_welcome(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
-    one = daemon(divided_map.root)
-    client = connect(one, name="visitor")
-    assert (client.major, client.instance, client.frame_id) == (2, one.instance, "map")
-    assert client.shm_dir == one.shm_dir
-    assert client.pid == one.pid
+def test_welcome(served: DaemonProcess, connect: Connect) -> None:
+    client = connect(served, name="visitor")
+    assert (client.major, client.instance, client.frame_id) == (2, served.instance, "map")
+    assert client.shm_dir == served.shm_dir
+    assert client.pid == served.pid
     assert client.cells == 36
     assert client.bounds == [-60.0, -60.0, 60.0, 60.0]
     assert client.layers[:3] == ["points", "voxel(leaf,leaf_x,leaf_y,leaf_z)", "ndt(leaf,min_points=6)"]
@@ -32,10 +31,7 @@ def test_welcome(daemon: DaemonFactory, connect: Connect, divided_map: DividedMa
     assert client.budget_bytes > 0
 
 
-def test_heights_leave_out_cells_once_they_are_known(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
-) -> None:
-    client = connect(daemon(divided_map.root))
+def test_heights_leave_out_cells_once_they_are_known(client: RawClient, divided_map: DividedMap) -> None:
     assert client.area(circle(0, 0, 25, (100.0, 200.0))).cells == []  # all are loaded to find that out
     everything = names(client.area(circle(0, 0, 25)).cells)
     assert everything == divided_map.in_circle(0, 0, 25)
@@ -90,6 +86,11 @@ NONSENSE: list[list[Any]] = [
     ["area", 1, ["circle", 0, 0, 1], []],
     ["area", 1, ["circle", 0, 0, 1], ["points"], -1.0],
     ["area", 1, ["circle", 0, 0, 1], ["points"], float("nan")],
+    ["area", 1, ["circle", 0, 0, 1], ["points"], 30.0, [float("nan"), 0.0]],
+    ["area", 1, ["circle", 0, 0, 1], ["points"], 30.0, [0.0, float("inf")]],
+    ["area", 1, ["circle", 0, 0, 1], ["points"], 30.0, [0.0, 0.0, float("nan")]],
+    ["area", 1, ["circle", 0, 0, 1], ["points"], 30.0, [0.0, 0.0, 0.0, 0.0, float("inf")]],
+    ["area", 1, ["circle", 0, 0, 1], ["points"], 30.0, [0.0, 0.0, 0.0, 0.0, None, [[0.0, float("nan")]]]],
     ["differential", 1, ["circle", 0, 0, 1], ["points"], [], b"1234567"],
     ["selected", 1, [5]],
     ["nonsense", 1],

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import DaemonProcess, Deadline, wait_ended
+from tests.support.daemon_process import DaemonProcess, until, wait_ended
 from tests.support.divided_map import DividedMap
 from tests.support.raw_client import RawClient, circle
 
@@ -68,9 +68,7 @@ def test_from_start_to_stop(
     for _ in range(3):
         assert manager.until("WATCHDOG=1") == ["WATCHDOG=1"]
     connect(one).area(circle(0, 0, 5))
-    waiting = Deadline()
-    while waiting("4 of 36 cells" not in manager.until("STATUS=")[0]):
-        pass
+    until(lambda: "4 of 36 cells" in manager.until("STATUS=")[0])
     assert "1 client" in manager.received[-1][0]
 
     one.send(signal.SIGHUP)

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.process.conftest import DaemonFactory
+from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap
 from tests.support.raw_client import RawClient, circle
 
@@ -58,22 +59,21 @@ def test_a_name_that_is_squatted(daemon: DaemonFactory, divided_map: DividedMap)
 
 
 def test_a_second_daemon_with_another_runtime_directory(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap, short_path: Path
+    served: DaemonProcess, connect: Connect, short_path: Path
 ) -> None:
     """It would take the segments of the first one for leftovers, and remove them when it is stopped."""
-    one = daemon(divided_map.root)
-    assert len(connect(one).area(circle(0, 0, 25)).cells) == 12
-    segments = one.segments()
+    assert len(connect(served).area(circle(0, 0, 25)).cells) == 12
+    segments = served.segments()
     place = short_path / "run"
-    one.arguments = ["--runtime-dir", str(place)]
-    assert one.run_to_end() == 75
-    assert f"another daemon (pid {one.pid}, listening at {one.endpoint})" in one.log
-    os.kill(one.pid, signal.SIGSTOP)  # a process keeps its locks while it exists
-    assert one.run_to_end() == 75
-    os.kill(one.pid, signal.SIGCONT)
-    assert (one.segments(), os.listdir(place)) == (segments, [])
-    one.arguments = []
-    assert len(connect(one).area(circle(0, 0, 25)).cells) == 12
+    served.arguments = ["--runtime-dir", str(place)]
+    assert served.run_to_end() == 75
+    assert f"another daemon (pid {served.pid}, listening at {served.endpoint})" in served.log
+    os.kill(served.pid, signal.SIGSTOP)  # a process keeps its locks while it exists
+    assert served.run_to_end() == 75
+    os.kill(served.pid, signal.SIGCONT)
+    assert (served.segments(), os.listdir(place)) == (segments, [])
+    served.arguments = []
+    assert len(connect(served).area(circle(0, 0, 25)).cells) == 12
 
 
 def test_endless_metadata(daemon: DaemonFactory, divided_map: DividedMap) -> None:

@@ -12,7 +12,7 @@ from shmmap_clients.scans.trajectory import read_trajectory
 
 import shmmap
 from tests.benchmarks.programs_side_by_side import run_three_programs, table
-from tests.support.daemon_process import DaemonProcess, Deadline
+from tests.support.daemon_process import DaemonProcess, until
 from tests.support.ndt_programs import make_town_drive
 
 Factory = Callable[..., DaemonProcess]
@@ -67,7 +67,5 @@ def test_three_programs_on_one_map(daemon: Factory, tmp_path: Path) -> None:
     with shmmap.connect(one.endpoint) as client:
         client.evict()
         assert not client.stats().unknown_holders
-        freed = Deadline()
-        while freed(client.stats().counters["zombies"] > 0):
-            pass
+        until(lambda: client.stats().counters["zombies"] <= 0)
     assert one.segments() == []

@@ -17,10 +17,10 @@ import pytest
 import shmmap
 from shmmap.segment.pins import lock_slot
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import DaemonProcess, Deadline
+from tests.support.daemon_process import DaemonProcess, Deadline, wait_ended
 from tests.support.divided_map import DividedMap, random_points
 from tests.support.mapping_process import MappingProcess
-from tests.support.raw_client import RawCells, RawClient, circle
+from tests.support.raw_client import DaemonError, RawCells, RawClient, circle
 from tests.support.segment_reader import read_segment
 from tests.support.segments import (
     damage_header,
@@ -52,63 +52,57 @@ def segments_of(reply: RawCells) -> dict[str, str]:
 
 @pytest.mark.parametrize("end", ["kill", "leave"])
 def test_what_was_loaded_serves_again(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap, end: str
+    served: DaemonProcess, client: RawClient, divided_map: DividedMap, end: str
 ) -> None:
     """After a crash and after a restart alike: the same segments, no file read again, readers undisturbed."""
-    one = daemon(divided_map.root)
-    client = connect(one)
-    before = segments_of(client.area(EVERYTHING))
-    path = f"{one.shm_dir}{before[divided_map.id('0_0.pcd')]}"
+    handles = client.area(EVERYTHING).cells
+    before, epoch = {handle.id: handle.segment for handle in handles}, client.epoch
+    path = f"{served.shm_dir}{before[divided_map.id('0_0.pcd')]}"
     checksum = zlib.crc32(Path(path).read_bytes())
     with MappingProcess([path]) as reader:
         if end == "kill":
-            one.kill()
+            served.kill()
+            assert all(wait_ended(pid, 10.0) for pid in served.children()), "a loader outlives it"
         else:
-            assert one.leave() == 0
-            left = [name for name in os.listdir(one.shm_dir) if name not in one.segments()]
-            assert (left, os.path.exists(one.endpoint)) == ([], False)
-        assert len(one.segments()) == len(before) == 36
-        one.start()
+            assert served.leave() == 0
+            left = [name for name in os.listdir(served.shm_dir) if name not in served.segments()]
+            assert (left, os.path.exists(served.endpoint)) == ([], False)
+        assert len(served.segments()) == len(before) == 36
+        assert reader.checksums() == [checksum]
+        served.start()
+        with pytest.raises(DaemonError, match="no_session"):
+            client.area(EVERYTHING)
         client.hello()
+        assert client.epoch != epoch
         again = client.area(EVERYTHING)
         assert_right(client, again, divided_map)
         assert segments_of(again) == before
+        held = client.differential(EVERYTHING, packed=[handle.version for handle in handles])
+        assert (held.cells, held.removed_versions) == ([], [])
         counters = client.ask("stats")[4]
         assert (counters["adopted"], counters["loads_started"], counters["adoptions_failed"]) == (36, 0, 0)
-        assert counters["bytes_resident"] == one.segment_bytes()
+        assert counters["bytes_resident"] == served.segment_bytes()
         assert reader.checksums() == [checksum]
-    assert one.stop() == 0  # a stop empties, adopted segments included
-    assert one.leftovers() == []
+    assert served.stop() == 0  # a stop empties, adopted segments included
+    assert served.leftovers() == []
 
 
 def test_a_sigterm_after_the_announcement_of_a_restart_changes_nothing(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+    served: DaemonProcess, connect: Connect
 ) -> None:
     """As a service manager does it: announce, then SIGTERM."""
-    one = daemon(divided_map.root)
-    connect(one).area(EVERYTHING)
-    before = one.segments()
-    one.send(signal.SIGSTOP)  # so that both are there when it looks
-    one.send(signal.SIGUSR1)
-    one.send(signal.SIGTERM)
-    assert one.process is not None
-    process, one.process = one.process, None
+    connect(served).area(EVERYTHING)
+    before = served.segments()
+    served.send(signal.SIGSTOP)  # so that both are there when it looks
+    served.send(signal.SIGUSR1)
+    served.send(signal.SIGTERM)
+    assert served.process is not None
+    process, served.process = served.process, None
     process.send_signal(signal.SIGCONT)
     assert process.wait(30) == 0
-    assert one.segments() == before
-    one.start()
-    assert one.segments() == before
-
-
-def test_a_stop_that_comes_first_stays_a_stop(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
-) -> None:
-    one = daemon(divided_map.root)
-    connect(one).area(EVERYTHING)
-    one.kill()
-    one.start()
-    assert one.stop() == 0
-    assert one.leftovers() == []
+    assert served.segments() == before
+    served.start()
+    assert served.segments() == before
 
 
 def test_a_waiting_request_is_answered_by_the_next_run(
@@ -143,31 +137,27 @@ def open_to_others(path: str) -> None:
     [damage_payload, damage_header, other_layout, damage_publish_block, shorten, punch, open_to_others],
 )
 def test_a_damaged_leftover_is_never_served(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap, damage: Callable[[str], None]
+    served: DaemonProcess, client: RawClient, divided_map: DividedMap, damage: Callable[[str], None]
 ) -> None:
-    one = daemon(divided_map.root)
-    client = connect(one)
     handle = client.selected(["0_0.pcd"]).cells[0]
-    one.kill()
+    served.kill()
     damage(client.path(handle))
-    one.start()
+    served.start()
     client.hello()
     reply = client.selected(["0_0.pcd"])
     assert reply.cells[0].segment != handle.segment
     assert_right(client, reply, divided_map)
-    one.until_segments(1, lambda: client.ask("stats"))
+    served.until_segments(1, lambda: client.ask("stats"))
 
 
 def test_a_damaged_leftover_is_known_until_it_is_no_longer_mapped(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+    served: DaemonProcess, client: RawClient, divided_map: DividedMap
 ) -> None:
-    one = daemon(divided_map.root)
-    client = connect(one)
     handle = client.selected(["0_0.pcd"]).cells[0]
     with MappingProcess([client.path(handle)]) as reader:
-        one.kill()
+        served.kill()
         damage_payload(client.path(handle))
-        one.start()
+        served.start()
         client.hello()
         reply = client.selected(["0_0.pcd"])
         assert_right(client, reply, divided_map)
@@ -176,25 +166,23 @@ def test_a_damaged_leftover_is_known_until_it_is_no_longer_mapped(
             [(reply.cells[0].segment, "resident"), (handle.segment, "zombie")]
         )
         assert reader.checksums()
-    one.until_segments(1, lambda: client.ask("stats"))
+    served.until_segments(1, lambda: client.ask("stats"))
 
 
 def test_what_changed_between_two_runs_is_loaded_again(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+    served: DaemonProcess, client: RawClient, divided_map: DividedMap
 ) -> None:
     """Changed, removed and moved cells of the map; the old state of one is still mapped and shows."""
-    one = daemon(divided_map.root)
-    client = connect(one)
     before = segments_of(client.area(EVERYTHING))
     changed = divided_map.id("0_0.pcd")
-    path = f"{one.shm_dir}{before[changed]}"
+    path = f"{served.shm_dir}{before[changed]}"
     checksum = zlib.crc32(Path(path).read_bytes())
     with MappingProcess([path]) as reader:
-        one.kill()
+        served.kill()
         divided_map.write_cell("0_0.pcd", (0, 0), random_points(np.random.default_rng(5), (0, 0), 700))
         divided_map.remove_cell("20_20.pcd")
         divided_map.write_metadata()
-        one.start()
+        served.start()
         client.hello()
         again = client.area(EVERYTHING)
         assert_right(client, again, divided_map)
@@ -205,44 +193,38 @@ def test_what_changed_between_two_runs_is_loaded_again(
             (after[changed], "resident"), (before[changed], "zombie"),
         ]  # fmt: skip
         assert reader.checksums() == [checksum]
-    one.until_segments(35, lambda: client.ask("stats"))
+    served.until_segments(35, lambda: client.ask("stats"))
 
 
-def test_names_that_are_no_segments_do_not_matter(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
-) -> None:
+def test_names_that_are_no_segments_do_not_matter(served: DaemonProcess, client: RawClient) -> None:
     """A pipe, a link to another segment, a directory: not waited for, not followed, not served."""
-    one: DaemonProcess = daemon(divided_map.root)
-    client = connect(one)
     handle = client.selected(["0_0.pcd"]).cells[0]
-    one.kill()
-    base = Path(one.shm_dir, f"shmmap.{one.instance}.")
+    served.kill()
+    base = Path(served.shm_dir, f"shmmap.{served.instance}.")
     os.mkfifo(f"{base}{'0' * 16}")
     os.symlink(client.path(handle), f"{base}{'1' * 16}")
     os.mkdir(f"{base}{'2' * 16}")
-    one.start()
+    served.start()
     client.hello()
     assert client.selected(["0_0.pcd"]).cells[0].segment == handle.segment
-    left = one.segments()
-    assert left == sorted([f"shmmap.{one.instance}.{'2' * 16}", handle.segment.lstrip("/")])
+    left = served.segments()
+    assert left == sorted([f"shmmap.{served.instance}.{'2' * 16}", handle.segment.lstrip("/")])
     os.rmdir(f"{base}{'2' * 16}")
 
 
 @pytest.mark.root
 def test_a_foreign_file_under_our_name_is_refused(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+    served: DaemonProcess, client: RawClient, divided_map: DividedMap
 ) -> None:
     """A perfect copy, but of another owner: the owner of a file can change it under its readers."""
-    one: DaemonProcess = daemon(divided_map.root)
-    client = connect(one)
     handle = client.selected(["0_0.pcd"]).cells[0]
-    one.kill()
+    served.kill()
     copy = f"{client.path(handle)[:-16]}{'3' * 16}"
     shutil.copyfile(client.path(handle), copy)
     os.chmod(copy, 0o444)
     os.chown(copy, 65534, 65534)
     os.unlink(client.path(handle))
-    one.start()
+    served.start()
     client.hello()
     reply = client.selected(["0_0.pcd"])
     assert reply.cells[0].segment not in (handle.segment, f"/{os.path.basename(copy)}")
@@ -268,17 +250,16 @@ def test_a_smaller_budget_takes_over_what_fits(
     assert one.segment_bytes() <= 1 << 20
 
 
-def test_who_holds_what_is_known_across_a_restart(daemon: DaemonFactory, divided_map: DividedMap) -> None:
+def test_who_holds_what_is_known_across_a_restart(served: DaemonProcess, divided_map: DividedMap) -> None:
     """A client that goes on is named: for what serves again, for what was replaced, for what left the map."""
-    one = daemon(divided_map.root)
-    with shmmap.connect(one.endpoint, name="the holder") as client:
+    with shmmap.connect(served.endpoint, name="the holder") as client:
         held = {cell.id: cell for cell in client.around(0, 0, 5).raise_for_failures()}
         slot = client.welcome.session
-        one.kill()
+        served.kill()
         divided_map.write_cell("0_0.pcd", (0, 0), random_points(np.random.default_rng(5), (0, 0), 700))
         divided_map.remove_cell("-20_0.pcd")
         divided_map.write_metadata()
-        one.start()
+        served.start()
         gone = divided_map.id("-20_0.pcd")
         for cell_id, state in (
             (divided_map.id("0_-20.pcd"), "resident"),
@@ -295,29 +276,27 @@ def test_who_holds_what_is_known_across_a_restart(daemon: DaemonFactory, divided
         stats = client.stats()
         (row,) = stats.sessions
         old = [held[divided_map.id("0_0.pcd")], held[gone]]
-        old_bytes = sum(os.stat(f"{one.shm_dir}{cell.segment}.zombie").st_size for cell in old)
+        old_bytes = sum(os.stat(f"{served.shm_dir}{cell.segment}.zombie").st_size for cell in old)
         assert (row.superseded, row.superseded_bytes) == (2, old_bytes)
-        assert row.mapped_bytes == one.segment_bytes()
+        assert row.mapped_bytes == served.segment_bytes()
         assert stats.unknown_holders == 0
         with pytest.raises(shmmap.UnknownCell):
             client.show("nowhere.pcd")
 
 
 def test_a_name_that_a_foreign_file_took(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+    served: DaemonProcess, client: RawClient, divided_map: DividedMap
 ) -> None:
     """What has to retire does so under another name; its reader and the next run are not disturbed."""
-    one = daemon(divided_map.root)
-    client = connect(one)
     (handle,) = client.selected(["0_0.pcd"]).cells
-    place = Path(f"{one.shm_dir}{handle.segment}.zombie")
+    place = Path(f"{served.shm_dir}{handle.segment}.zombie")
     place.mkdir()  # as another account's file in a sticky directory, it cannot be replaced
-    with MappingProcess([f"{one.shm_dir}{handle.segment}"]) as reader:
+    with MappingProcess([f"{served.shm_dir}{handle.segment}"]) as reader:
         (checksum,) = reader.checksums()
-        one.kill()
+        served.kill()
         corner = divided_map.corners["0_0.pcd"]
         divided_map.write_cell("0_0.pcd", corner, random_points(np.random.default_rng(9), corner, 50))
-        one.start()
+        served.start()
         client.hello()
         again = client.selected(["0_0.pcd"])
         assert_right(client, again, divided_map)

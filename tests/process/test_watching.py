@@ -13,17 +13,9 @@ import pytest
 
 from shmmap import CellSet, connect
 from shmmap.events import EventStream
-from shmmap.protocol import events as e
 from tests.process.conftest import DaemonFactory
+from tests.support.daemon_process import DaemonProcess, next_reload
 from tests.support.divided_map import DividedMap, make_map, random_points
-
-
-def next_reload(stream: EventStream) -> e.Reloaded:
-    while True:
-        happening = stream.next(60.0)
-        assert happening is not None, "no reload was reported"
-        if isinstance(happening, e.Reloaded):
-            return happening
 
 
 def test_what_is_written_is_served(daemon: DaemonFactory, divided_map: DividedMap) -> None:
@@ -67,9 +59,8 @@ def test_a_map_that_is_away_for_a_while(daemon: DaemonFactory, divided_map: Divi
         assert next_reload(stream).changed == 1
 
 
-def test_without_the_setting_nothing_is_watched(daemon: DaemonFactory, divided_map: DividedMap) -> None:
-    one = daemon(divided_map.root)
-    with connect(one.endpoint) as client, EventStream(one.endpoint, timeout=30.0) as stream:
+def test_without_the_setting_nothing_is_watched(served: DaemonProcess, divided_map: DividedMap) -> None:
+    with connect(served.endpoint) as client, EventStream(served.endpoint, timeout=30.0) as stream:
         divided_map.change("0_0.pcd", 5)
         client.reload()
         assert next_reload(stream).changed == 1

@@ -42,11 +42,8 @@ def window_of(one: DaemonProcess, *, update_distance: float, refresh_interval: f
     )  # fmt: skip
 
 
-def test_it_asks_when_it_has_moved_or_its_interval_is_over(
-    daemon: Factory, divided_map: DividedMap, asked: list[type]
-) -> None:
-    one = daemon(divided_map.root)
-    with window_of(one, update_distance=2.0, refresh_interval=NEVER_S) as window:
+def test_it_asks_when_it_has_moved_or_its_interval_is_over(served: DaemonProcess, asked: list[type]) -> None:
+    with window_of(served, update_distance=2.0, refresh_interval=NEVER_S) as window:
         window.move_to(0, 0, wait=LONG_S)
         asked.clear()
         for step in range(1, 10):
@@ -54,7 +51,7 @@ def test_it_asks_when_it_has_moved_or_its_interval_is_over(
         assert asked == []
         window.move_to(2.0, 0)
         assert asked == [Differential]
-    with window_of(one, update_distance=NEVER_S, refresh_interval=ALWAYS_S) as window:
+    with window_of(served, update_distance=NEVER_S, refresh_interval=ALWAYS_S) as window:
         window.move_to(0, 0, wait=LONG_S)
         asked.clear()
         for _ in range(3):
@@ -63,12 +60,11 @@ def test_it_asks_when_it_has_moved_or_its_interval_is_over(
 
 
 def test_a_reload_is_seen_by_the_next_request(
-    daemon: Factory, divided_map: DividedMap, asked: list[type]
+    served: DaemonProcess, divided_map: DividedMap, asked: list[type]
 ) -> None:
-    one = daemon(divided_map.root)
     with (
-        shmmap.connect(one.endpoint) as admin,
-        window_of(one, update_distance=0, refresh_interval=ALWAYS_S) as window,
+        shmmap.connect(served.endpoint) as admin,
+        window_of(served, update_distance=0, refresh_interval=ALWAYS_S) as window,
     ):
         window.move_to(0, 0, wait=LONG_S)
         divided_map.change("0_0.pcd", 5)
@@ -96,8 +92,7 @@ def test_it_knows_where_failed_cells_lie_without_asking_for_a_list(
         assert set(asked) == {Differential}
 
 
-def test_nothing_says_where_an_unknown_cell_lies(daemon: Factory, divided_map: DividedMap) -> None:
-    one = daemon(divided_map.root)
-    with shmmap.connect(one.endpoint) as client:
+def test_nothing_says_where_an_unknown_cell_lies(served: DaemonProcess) -> None:
+    with shmmap.connect(served.endpoint) as client:
         (failure,) = client.selected(["nowhere.pcd"], strict=None).failed
         assert failure.box is None

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import json
 import random
-import subprocess
 import sys
 import time
 import zlib
@@ -25,7 +24,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import shmmap
-from tests.support.daemon_process import ROOT
+from tests.support.daemon_process import LineProcess
 
 
 @dataclass(frozen=True)
@@ -48,43 +47,15 @@ class Holding:
     pending: tuple[str, ...]
 
 
-class _ClientProcess:
+class _ClientProcess(LineProcess):
     """One of these programs, which answers each line of JSON by one."""
 
     def __init__(self, *words: str) -> None:
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "tests.support.client_programs", *words],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            bufsize=1,
-            cwd=ROOT,
-        )
-
-    @property
-    def pid(self) -> int:
-        """Its process id."""
-        return self.process.pid
-
-    def _write(self, what: object) -> None:
-        assert self.process.stdin is not None
-        self.process.stdin.write(json.dumps(what) + "\n")
+        super().__init__(sys.executable, "-m", "tests.support.client_programs", *words)
 
     def answer(self) -> Any:
         """Return its next answer."""
-        assert self.process.stdout is not None
-        line = self.process.stdout.readline()
-        assert line, "the client ended"
-        return json.loads(line)
-
-    def end(self) -> None:
-        """Close its input, and wait for its end."""
-        self.process.communicate(timeout=30)
-
-    def kill(self) -> None:
-        """End it now, whatever it does, and wait for its end."""
-        self.process.kill()
-        self.process.communicate()
+        return json.loads(self.read())
 
 
 class HoldingClient(_ClientProcess):
@@ -96,7 +67,7 @@ class HoldingClient(_ClientProcess):
 
     def hold(self, what: list[float] | None) -> Holding:
         """Send a line and return what it holds then."""
-        self._write(what)
+        self.write(json.dumps(what))
         seen = self.answer()
         return Holding(
             tuple(HeldRow(*row) for row in seen["held"]),
@@ -113,7 +84,7 @@ class FollowingClient(_ClientProcess):
 
     def ask(self, x: float, y: float, radius: float) -> None:
         """Send a pose."""
-        self._write([x, y, radius])
+        self.write(json.dumps([x, y, radius]))
 
 
 def _hold(endpoint: str) -> None:

@@ -19,7 +19,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tests.support.cpp_client import INCLUDE
-from tests.support.daemon_process import ROOT
+from tests.support.daemon_process import ROOT, LineProcess
 
 
 def built_pcl_program(
@@ -75,9 +75,7 @@ class PclLeaves:
 
     def __init__(self, program: Path, endpoint: str, leaf: float) -> None:
         words = [program, endpoint, 0.0, 0.0, 1e6, leaf]
-        self._process = subprocess.Popen(
-            list(map(str, words)), stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-        )
+        self._program = LineProcess(*map(str, words))
 
     def __enter__(self) -> PclLeaves:
         return self
@@ -85,7 +83,7 @@ class PclLeaves:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._process.communicate()
+        self._program.end()
 
     def compare(self) -> list[dict[str, Any]]:
         """Leaves of each cell, and how far they are apart."""
@@ -101,15 +99,8 @@ class PclLeaves:
         return found
 
     def _ask(self, what: str) -> list[dict[str, Any]]:
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        print(what, file=self._process.stdin, flush=True)
-        found: list[dict[str, Any]] = []
-        for line in self._process.stdout:
-            if line == "\n":
-                return found
-            found.append(json.loads(line))
-        raise AssertionError(f"it ended with {self._process.wait()}")
+        self._program.write(what)
+        return [json.loads(line) for line in iter(self._program.read, "")]
 
 
 # PCL's own NDT, where g++ and libpcl-dev are: a small program, compiled on the spot, asked by lines
@@ -163,9 +154,7 @@ class PclNdt:
         for name, cloud in (("target", target), ("source", source)):
             np.ascontiguousarray(cloud, np.float32).tofile(program.parent / name)
         words = [program, program.parent / "target", program.parent / "source", leaf]
-        self._process = subprocess.Popen(
-            list(map(str, words)), stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-        )
+        self._program = LineProcess(*map(str, words))
 
     def __enter__(self) -> PclNdt:
         return self
@@ -173,7 +162,7 @@ class PclNdt:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._process.communicate()
+        self._program.end()
 
     def evaluate(self, pose: NDArray[np.float64], repeats: int = 1) -> PclEvaluation:
         """Return score, gradient and Hessian at a pose vector, (6,)."""
@@ -188,10 +177,8 @@ class PclNdt:
         return PclAlignment(found["iterations"], found["score_per_point"], T)
 
     def _ask(self, what: str, pose: NDArray[np.float64], *words: float) -> dict[str, Any]:
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        print(what, *map(repr, pose.tolist()), *words, file=self._process.stdin, flush=True)
-        answer: dict[str, Any] = json.loads(self._process.stdout.readline())
+        self._program.write(" ".join(map(str, (what, *pose.tolist(), *words))))
+        answer: dict[str, Any] = json.loads(self._program.read())
         return answer
 
 
@@ -262,20 +249,15 @@ class ControlLoop:
         wait: float = 5.0,
         wrapper: Sequence[str] = (),
     ) -> None:
-        self._process = subprocess.Popen(
-            [*wrapper, program, endpoint, str(radius), str(wait)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
+        self._program = LineProcess(*wrapper, program, endpoint, str(radius), str(wait))
 
     def begin(self, steps: int, *, wait: float = 0.02, period: float = 0.01) -> None:
         """Have it begin ``rounds`` rounds."""
-        self._say(f"go {steps} {wait} {period}")
+        self._program.write(f"go {steps} {wait} {period}")
 
     def rounds(self) -> Rounds:
         """Return what came of them."""
-        calls, sleeps, codes, current = (self._line().split() for _ in range(4))
+        calls, sleeps, codes, current = (self._program.read().split() for _ in range(4))
         return Rounds(
             [int(one) * 1e-9 for one in calls],
             [int(one) * 1e-9 for one in sleeps],
@@ -290,22 +272,11 @@ class ControlLoop:
 
     def complete(self, seconds: float) -> tuple[bool, float, dict[str, int]]:
         """Wait until nothing is missing; returns whether it is so, where the vehicle is, and its cells."""
-        self._say(f"complete {seconds}")
-        state, cells = self._line().split(), self._line().split()
+        self._program.write(f"complete {seconds}")
+        state, cells = self._program.read().split(), self._program.read().split()
         return state[0] == "1", float(state[2]), dict(zip(cells[::2], map(int, cells[1::2]), strict=True))
 
     def close(self) -> int:
         """End it; returns its exit code."""
-        self._process.communicate()
-        return self._process.returncode
-
-    def _say(self, line: str) -> None:
-        assert self._process.stdin is not None
-        self._process.stdin.write(line + "\n")
-        self._process.stdin.flush()
-
-    def _line(self) -> str:
-        assert self._process.stdout is not None
-        line = self._process.stdout.readline()
-        assert line.endswith("\n"), f"it ended with {self._process.wait()}"
-        return line
+        self._program.end()
+        return int(self._program.process.returncode)

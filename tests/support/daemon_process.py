@@ -9,7 +9,7 @@ import subprocess
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeVar
 
 from shmmap.events import EventStream
 from shmmap.protocol import events as e
@@ -32,7 +32,9 @@ __all__ = [
     "TIMEOUT_S",
     "DaemonProcess",
     "Deadline",
+    "LineProcess",
     "counters",
+    "first_answer",
     "next_reload",
     "open_files",
     "processes_marked",
@@ -41,6 +43,8 @@ __all__ = [
     "wait_ended",
     "wait_readable",
 ]
+
+_Answer = TypeVar("_Answer")
 
 
 def _stat(pid: int) -> list[str]:
@@ -55,9 +59,7 @@ def _parent_of(pid: int) -> int:
 def stop(pid: int) -> None:
     """SIGSTOP a process, and wait until it stands still."""
     os.kill(pid, signal.SIGSTOP)
-    waiting = Deadline()
-    while waiting(_stat(pid)[0] != "T"):
-        pass
+    until(lambda: _stat(pid)[0] == "T")
 
 
 class DaemonProcess(daemon_process.DaemonProcess):
@@ -130,6 +132,48 @@ class DaemonProcess(daemon_process.DaemonProcess):
             ask()
 
 
+class LineProcess:
+    """A program that is written lines and prints some; killed at the end of its ``with`` block."""
+
+    def __init__(self, *command: str | Path, **options: Any) -> None:
+        self.process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT, **options
+        )
+
+    def __enter__(self) -> LineProcess:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.kill()
+
+    @property
+    def pid(self) -> int:
+        """Its process id."""
+        return self.process.pid
+
+    def read(self) -> str:
+        """Wait for the next line; it may not have ended."""
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        assert line, f"it ended with {self.process.wait()}"
+        return str(line).rstrip("\n")
+
+    def write(self, line: str = "") -> None:
+        """Send a line."""
+        assert self.process.stdin is not None
+        self.process.stdin.write(line + "\n")
+        self.process.stdin.flush()
+
+    def end(self) -> None:
+        """Close its input, and wait for its end."""
+        self.process.communicate(timeout=30)
+
+    def kill(self) -> None:
+        """End it now, whatever it does, and wait for its end."""
+        self.process.kill()
+        self.process.communicate()
+
+
 # A limit for loops that ask until something has happened: a defect fails one test, not the whole run
 
 
@@ -147,10 +191,10 @@ class Deadline:
         self._end_s = time.monotonic() + LIMIT_S
         self._pause_s = FIRST_PAUSE_S
 
-    def __call__(self, not_yet: bool) -> bool:
-        """Return ``not_yet``; AssertionError once that has been so for too long."""
+    def __call__(self, not_yet: bool, why: Callable[[], str] = str) -> bool:
+        """Return ``not_yet``; AssertionError, which says why, once that has been so for too long."""
         if not_yet:
-            assert time.monotonic() < self._end_s, f"it did not happen within {LIMIT_S:.0f} s"
+            assert time.monotonic() < self._end_s, f"it did not happen within {LIMIT_S:.0f} s. {why()}"
             time.sleep(self._pause_s)
             self._pause_s = min(2 * self._pause_s, LONGEST_PAUSE_S)
         return not_yet
@@ -162,12 +206,19 @@ class Deadline:
 TIMEOUT_S = 60.0
 
 
-def until(done: Callable[[], object], why: Callable[[], str]) -> None:
+def until(done: Callable[[], object], why: Callable[[], str] = str) -> None:
     """Wait until something is so; ``why`` says what is instead."""
-    end_s = time.monotonic() + TIMEOUT_S
+    first_answer(done, bool, why)
+
+
+def first_answer(
+    ask: Callable[[], _Answer], fits: Callable[[_Answer], object], why: Callable[[], str] = str
+) -> _Answer:
+    """Ask until an answer fits, and return that one; ``why`` says what is instead."""
     waiting = Deadline()
-    while waiting(not done()):
-        assert time.monotonic() < end_s, why()
+    while waiting(not fits(answer := ask()), why):
+        pass
+    return answer
 
 
 def counters(one: DaemonProcess) -> dict[str, int]:

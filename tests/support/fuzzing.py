@@ -16,7 +16,8 @@ import tempfile
 import time
 import traceback
 import zlib
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -327,11 +328,27 @@ TARGETS: Final = {
 _CHILD_S: Final = 30.0
 
 
-def print_outcomes(seed: int, count: int, slowest_s: float, outcomes: Mapping[str, int]) -> None:
-    """Print what a child did."""
+def limit_memory(more_bytes: int) -> None:
+    """Let this process have that many bytes of address space more than it has now."""
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    limit = pages * resource.getpagesize() + more_bytes
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+
+
+def repeat(step: Callable[[], str], seed: int, seconds: float) -> int:
+    """Take a step that returns its outcome until the time is over, and print what came of it; returns 0."""
+    outcomes: Counter[str] = Counter()
+    slowest_s, started = 0.0, time.monotonic()
+    end_s = started + seconds
+    while started < end_s:
+        outcomes[step()] += 1
+        before, started = started, time.monotonic()
+        slowest_s = max(slowest_s, started - before)
     table = " ".join(f"{name}={number}" for name, number in sorted(outcomes.items()))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(f"seed {seed}: {count} inputs, slowest {slowest_s * 1e3:.0f} ms, peak {peak:.0f} MB: {table}")
+    inputs = f"{outcomes.total()} inputs, slowest {slowest_s * 1e3:.0f} ms"
+    print(f"seed {seed}: {inputs}, peak {peak:.0f} MB: {table}")
+    return 0
 
 
 def fuzz_in_children(name: str, docstring: str | None, child: Callable[[Path, int, float], int]) -> int:

@@ -39,7 +39,12 @@ def scans_of_the_street() -> list[Scan]:
 
 
 def live_daemon(
-    stack: ExitStack, state: Path, map_path: Path | str, *flags: str, linger_s: float = 2.0
+    stack: ExitStack,
+    state: Path,
+    map_path: Path | str,
+    *flags: str,
+    linger_s: float = 2.0,
+    **options: Any,
 ) -> DaemonProcess:
     """Start a daemon that keeps a live map in a directory; it is stopped and removed with the stack."""
     state.mkdir(parents=True, exist_ok=True)
@@ -47,7 +52,7 @@ def live_daemon(
     settings.write_text(
         f'[live.{MAP}]\nresolution = {RESOLUTION}\nlinger_s = {linger_s}\npath = "{state}/map"\n'
     )
-    one = DaemonProcess(map_path, "--config", str(settings), *flags)
+    one = DaemonProcess(map_path, "--config", str(settings), *flags, **options)
     return stack.enter_context(one)
 
 

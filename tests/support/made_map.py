@@ -38,7 +38,7 @@ from shmmap.origin.remote.map_versions import CURRENT, Current, pack_json
 from shmmap.origin.remote.published_index import EXACT, LayerObjects, Root, Shard, pack_root, pack_shard
 from shmmap.origin.remote.published_object import POINTS, bare_object, blob_path
 from shmmap.origin.remote.zstd_frame import LEVEL, pack_frame
-from tests.support.slow_link import LineProcess, line_process
+from tests.support.daemon_process import LineProcess
 from tests.support.web_servers import faulty_web
 
 if TYPE_CHECKING:
@@ -265,7 +265,7 @@ class ServedMadeMap:
 
     def cells_sent(self) -> int:
         """Number of cells' objects sent whole so far."""
-        self._process.write("")
+        self._process.write()
         return int(self._process.read())
 
     @property
@@ -277,7 +277,7 @@ class ServedMadeMap:
 @contextmanager
 def serve_made_map(cells: int, points: int) -> Iterator[ServedMadeMap]:
     """Serve a map by a process of its own until the end of the block."""
-    with line_process("tests.support.made_map", str(cells), str(points)) as process:
+    with LineProcess(sys.executable, "-m", "tests.support.made_map", str(cells), str(points)) as process:
         yield ServedMadeMap(process)
 
 

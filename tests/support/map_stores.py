@@ -30,7 +30,7 @@ from typing import Any, Final
 import pytest
 
 from tests.support.command_line import Verbs
-from tests.support.daemon_process import ROOT, Deadline
+from tests.support.daemon_process import Deadline, LineProcess, until
 from tests.support.divided_map import make_map
 
 
@@ -120,23 +120,13 @@ def bucket_server(folder: Path) -> Iterator[BucketServer]:
     """Run a server until the end of the block."""
     log = folder / "requests.log"
     log.touch()
-    process = subprocess.Popen(
-        [sys.executable, "-W", "ignore", "-m", "tests.support.map_stores", str(log)],
-        cwd=ROOT,
-        stdout=subprocess.PIPE,
-        stdin=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        assert process.stdout is not None
-        server = BucketServer(int(process.stdout.readline()), log)
+    command = [sys.executable, "-W", "ignore", "-m", "tests.support.map_stores", str(log)]
+    with LineProcess(*command) as process:
+        server = BucketServer(int(process.read()), log)
         urllib.request.urlopen(
             urllib.request.Request(f"{server.endpoint}/{BUCKET}", method="PUT"), timeout=30
         ).close()
         yield server
-    finally:
-        process.kill()
-        process.communicate()
 
 
 def main() -> None:
@@ -280,9 +270,7 @@ class CephServer(BucketServer):
 
     def wait_for_disks(self, up: int) -> None:
         """Wait until this number of disks is up."""
-        waiting = Deadline()
-        while waiting(f" {up} up" not in self.run("ceph", "osd", "stat")):
-            pass
+        until(lambda: f" {up} up" in self.run("ceph", "osd", "stat"))
 
     def wait_for_gateway(self) -> None:
         """Wait until the gateway answers."""

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from shmmap.testing.daemon_process import without_settings
-from tests.support.daemon_process import ROOT, Deadline, processes_marked, wait_ended, wait_readable
+from tests.support.daemon_process import ROOT, Deadline, processes_marked, until, wait_ended, wait_readable
 
 _BLOCK = re.compile(r"^<!-- ([\w-]+) -->\n```\w+\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _LINK = re.compile(r"\]\(([^)\s]+)\)")
@@ -219,9 +219,7 @@ class Reader:
     def leave(self) -> None:
         """Remove what the reader had; fails where a process or a segment was left behind."""
         try:
-            waiting = Deadline()
-            while waiting(bool(processes_marked(self.mark))):  # on a busy machine they take a moment to end
-                os.sched_yield()
+            until(lambda: not processes_marked(self.mark))  # on a busy machine they take a moment to end
             assert list(self.shm_dir.iterdir()) == []
         finally:
             shutil.rmtree(self.shm_dir)

@@ -7,8 +7,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import shmmap
+from tests.support import daemon_process
 from tests.support.command_line import health
-from tests.support.daemon_process import ROOT, DaemonProcess, Deadline
+from tests.support.daemon_process import ROOT, DaemonProcess, Deadline, first_answer
 from tests.support.web_servers import FaultyWeb
 
 __all__ = [
@@ -28,22 +29,12 @@ ALL = shmmap.Box(-1e6, -1e6, 1e6, 1e6)
 
 def until(done: Callable[..., object], *values: object) -> None:
     """Wait until something is so of these values."""
-    waiting = Deadline()
-    while waiting(not done(*values)):
-        pass
+    daemon_process.until(lambda: done(*values))
 
 
 def until_health(one: DaemonProcess, code: int, says: str = "") -> str:
     """Wait until ``shmmap health --strict`` ends with a code and says something; returns what it prints."""
-    printed: list[str] = []
-
-    def done() -> bool:
-        found, text = health(one)
-        printed.append(text)
-        return found == code and says in text
-
-    until(done)
-    return printed[-1]
+    return first_answer(lambda: health(one), lambda found: found[0] == code and says in found[1])[1]
 
 
 def until_taken(one: DaemonProcess) -> None:
@@ -53,10 +44,7 @@ def until_taken(one: DaemonProcess) -> None:
 
 def all_cells(client: shmmap.Client) -> shmmap.CellSet:
     """Wait until a request for all cells is answered in full; returns them."""
-    waiting = Deadline()
-    while waiting(not (cells := client.area(ALL, wait=5.0)).complete):
-        pass
-    return cells
+    return first_answer(lambda: client.area(ALL, wait=5.0), lambda cells: cells.complete)
 
 
 def versions_of(one: DaemonProcess) -> dict[str, int]:

@@ -18,14 +18,13 @@ import json
 import math
 import os
 import random
-import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Final, NamedTuple, TypeAlias
 
-from tests.support.daemon_process import ROOT
+from tests.support.daemon_process import LineProcess
 
 SIGMA: Final = 0.8
 """Standard deviation of the logarithm of an answer's time."""
@@ -82,7 +81,7 @@ class SlowLink:
 @contextmanager
 def slow_link(plan: Plan) -> Iterator[SlowLink]:
     """Run a link until the end of the block."""
-    with line_process("tests.support.slow_link", json.dumps(plan)) as process:
+    with LineProcess(sys.executable, "-m", "tests.support.slow_link", json.dumps(plan)) as process:
         yield SlowLink(process)
 
 
@@ -209,44 +208,6 @@ async def _serve(plan: Plan) -> None:
     print(server.sockets[0].getsockname()[1], flush=True)
     async with server:
         await server.serve_forever()
-
-
-# A module of the tests that runs as a process and is spoken to by lines
-
-
-class LineProcess:
-    """The process; it reads lines from stdin and prints lines."""
-
-    def __init__(self, process: subprocess.Popen[str]) -> None:
-        self._process = process
-
-    def read(self) -> str:
-        """Wait for the next line."""
-        assert self._process.stdout is not None
-        return self._process.stdout.readline()
-
-    def write(self, line: str) -> None:
-        """Send a line."""
-        assert self._process.stdin is not None
-        self._process.stdin.write(line + "\n")
-        self._process.stdin.flush()
-
-
-@contextmanager
-def line_process(module: str, *words: str) -> Iterator[LineProcess]:
-    """Run ``python -m module words...`` until the end of the block."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", module, *words],
-        cwd=ROOT,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        yield LineProcess(process)
-    finally:
-        process.kill()
-        process.communicate()
 
 
 if __name__ == "__main__":

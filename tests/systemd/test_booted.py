@@ -13,7 +13,7 @@ from types import TracebackType
 import pytest
 
 from tests.support.booted_systemd import BootedSystemd
-from tests.support.daemon_process import Deadline
+from tests.support.daemon_process import Deadline, first_answer, until
 from tests.support.divided_map import DividedMap
 from tests.systemd.conftest import MAP, RUN
 
@@ -72,6 +72,11 @@ class Client:
 def shmmap(machine: BootedSystemd, *words: str, user: str = "") -> subprocess.CompletedProcess[str]:
     """Run the command line inside."""
     return machine.run(sys.executable, "-m", "shmmap.cli", *words, user=user, check=False)
+
+
+def until_state(machine: BootedSystemd, unit: str, *states: str) -> dict[str, str]:
+    """Wait until a unit is in one of these states; returns its properties."""
+    return first_answer(lambda: machine.properties(unit), lambda found: found["ActiveState"] in states)
 
 
 def segments(machine: BootedSystemd, instance: str = "default", *, at: str = "/dev/shm") -> dict[str, str]:
@@ -159,12 +164,8 @@ def test_a_reload_shows_what_changed(fresh: BootedSystemd, the_map: DividedMap) 
         the_map.write_cell("0_0.pcd", (0, 0), {name: values[:7] for name, values in points.items()})
         fresh.run("systemctl", "reload", "shmmapd")
         # systemd 252 may count the reload as done just before it learns that it began
-        waiting = Deadline()
-        while waiting((after := alice.ask()) == before):
-            pass
-        while waiting((state := fresh.properties("shmmapd")["ActiveState"]) == "reloading"):
-            pass
-        assert state == "active"
+        after = first_answer(alice.ask, lambda now: now != before)
+        assert until_state(fresh, "shmmapd", "active", "failed")["ActiveState"] == "active"
         assert {name for name in before if before[name] != after[name]} == {"0_0.pcd"}
         assert fresh.properties("shmmapd")["NRestarts"] == "0"
 
@@ -181,9 +182,7 @@ def test_the_watchdog_ends_a_daemon_that_hangs_and_the_next_one_is_warm(fresh: B
         names = segments(fresh)
         pid = fresh.properties("shmmapd")["MainPID"]
         fresh.run("kill", f"-{int(signal.SIGSTOP)}", pid)
-        waiting = Deadline()
-        while waiting(fresh.properties("shmmapd")["MainPID"] in ("0", pid)):
-            pass
+        until(lambda: fresh.properties("shmmapd")["MainPID"] not in ("0", pid))
         fresh.run("systemctl", "start", "shmmapd")  # returns when it is ready
         assert "Watchdog timeout" in fresh.shell("journalctl --sync; journalctl --no-pager -u shmmapd")
         assert alice.held() == before
@@ -275,9 +274,7 @@ def test_live_maps_have_a_place_and_the_rights_that_they_need(fresh: BootedSyste
     """)
     done = shmmap(fresh, "status", "--json", user="alice")
     assert [row["name"] for row in json.loads(done.stdout)["live"]] == ["lidar"], done.stderr
-    waiting = Deadline()  # points are served before live maps are
-    while waiting(fresh.shell("ls -d /dev/shm/shmmap-live.default.marks || true") == ""):
-        pass
+    until(lambda: fresh.shell("ls -d /dev/shm/shmmap-live.default.marks || true") != "")
     places = "/var/lib/shmmap /var/lib/shmmap/state/default /var/lib/shmmap/state/default/live/lidar"
     assert fresh.shell(f"stat -c '%a %U:%G' {places} /dev/shm/shmmap-live.default.marks").splitlines() == [
         "755 root:root",
@@ -303,13 +300,9 @@ def test_administrators_reload_and_stop(fresh: BootedSystemd) -> None:
     assert done.returncode == 0, done.stderr
     done = shmmap(fresh, "stop", user="alice")
     assert done.returncode == 0, done.stderr
-    waiting = Deadline()
-    while waiting((unit := fresh.properties("shmmapd"))["ActiveState"] != "inactive"):
-        pass
-    assert (unit["Result"], unit["NRestarts"]) == (
-        "success",
-        "0",
-    )  # it was intended: systemd does not start it again
+    unit = until_state(fresh, "shmmapd", "inactive")
+    # it was intended: systemd does not start it again
+    assert (unit["Result"], unit["NRestarts"]) == ("success", "0")
 
 
 @pytest.mark.parametrize(
@@ -390,10 +383,7 @@ def test_a_waiting_client_does_not_keep_starting_what_stays_down(fresh: BootedSy
         fresh.run("systemctl", "start", "shmmapd.socket")
         refused = shmmap(fresh, "query", "--circle", "0,0,25", "--timeout", "60", user="alice")
         assert refused.returncode == 69, refused
-        waiting = Deadline()
-        while waiting((socket := fresh.properties("shmmapd.socket"))["ActiveState"] != "failed"):
-            pass
-        assert socket["Result"] == "trigger-limit-hit"
+        assert until_state(fresh, "shmmapd.socket", "failed")["Result"] == "trigger-limit-hit"
     finally:
         fresh.shell("mv /etc/shmmap/kept /etc/shmmap/shmmap.toml")
     waiting = Deadline()  # the limit still counts for some seconds

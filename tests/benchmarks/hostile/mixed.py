@@ -21,9 +21,10 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.support.daemon_process import ROOT, DaemonProcess
+from tests.support.daemon_process import DaemonProcess, LineProcess
 from tests.support.divided_map import make_map
 from tests.support.message_pack import pack
+from tests.support.process_costs import processor_s
 from tests.support.raw_client import RawClient, pack_versions
 
 __all__ = ["beside_hostile_and_busy"]
@@ -95,40 +96,25 @@ while True:
 )
 
 
-def start(program: str, *arguments: str) -> subprocess.Popen[bytes]:
+def start(program: str, *arguments: str) -> LineProcess:
     """Start one meddler and stop it again, until its turn comes."""
-    process = subprocess.Popen(
-        [sys.executable, "-c", program, *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        cwd=ROOT,
-    )
-    assert process.stdout is not None
-    process.stdout.readline()
-    process.send_signal(signal.SIGSTOP)
-    return process
-
-
-def processor_s(pids: list[int]) -> float:
-    """Seconds of processor time that processes have used."""
-    ticks = 0
-    for pid in pids:
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-        ticks += int(fields[11]) + int(fields[12])
-    return ticks / os.sysconf("SC_CLK_TCK")
+    started = LineProcess(sys.executable, "-c", program, *arguments, stderr=subprocess.DEVNULL)
+    started.read()
+    started.process.send_signal(signal.SIGSTOP)
+    return started
 
 
 @contextlib.contextmanager
-def running(processes: list[subprocess.Popen[bytes]]) -> Iterator[None]:
+def running(processes: list[LineProcess]) -> Iterator[None]:
     """Let some meddlers run."""
     for process in processes:
-        process.send_signal(signal.SIGCONT)
+        process.process.send_signal(signal.SIGCONT)
     time.sleep(SETTLE_S)
     try:
         yield
     finally:
         for process in processes:
-            process.send_signal(signal.SIGSTOP)
+            process.process.send_signal(signal.SIGSTOP)
 
 
 def paced(client: RawClient, request: bytes, seconds: float) -> list[float]:
@@ -167,16 +153,15 @@ def beside_hostile_and_busy(rounds: int, seconds: float) -> None:
             for _ in range(rounds):
                 for name, processes in groups.items():
                     pids = [process.pid for process in processes]
-                    before_s = processor_s(pids)
+                    before_s = sum(map(processor_s, pids))
                     begin_s = time.monotonic()
                     with running(processes):
                         times[name].append(paced(client, request, seconds))
-                    used[name] += processor_s(pids) - before_s
+                    used[name] += sum(map(processor_s, pids)) - before_s
                     began[name] += time.monotonic() - begin_s
         finally:
             for process in [p for processes in groups.values() for p in processes]:
                 process.kill()
-                process.communicate()
             client.close()
             one.stop()
             one.dispose()

@@ -27,6 +27,7 @@ from tests.benchmarks.hostile.beside import Beside
 from tests.benchmarks.hostile.stage import Report, Stage, scene
 from tests.support.daemon_process import ROOT
 from tests.support.message_pack import pack
+from tests.support.plain_client import PlainClient
 from tests.support.process_costs import descriptors
 from tests.support.raw_client import RawClient, circle
 
@@ -34,18 +35,6 @@ DESCRIPTORS: Final = 1024
 STILL_MAPPED: Final = 100
 REST_S: Final = 3.0
 MAX_FAILURES: Final = 50
-GREETING: Final = b"\xff" + bytes(8) + b"\x7f\x03\x00NULL" + bytes(16 + 32)
-
-
-def zmtp(path: str, kind: bytes) -> socket.socket:
-    """Open a connection that says it is a ZeroMQ socket of a kind."""
-    one = socket.socket(socket.AF_UNIX)
-    one.settimeout(10.0)
-    one.connect(path)
-    body = b"\x05READY\x0bSocket-Type" + struct.pack(">I", len(kind)) + kind
-    one.sendall(GREETING + b"\x04" + bytes([len(body)]) + body)
-    one.recv(64)
-    return one
 
 
 def subscribes(orders: Orders, path: str) -> dict[str, int]:
@@ -53,10 +42,10 @@ def subscribes(orders: Orders, path: str) -> dict[str, int]:
     found = {"prefixes": 0, "ended": 0}
     while orders.go_on():
         try:
-            with zmtp(path, b"SUB") as one:
+            with contextlib.closing(PlainClient(path, ready="ready of a SUB", timeout_s=10.0)) as one:
                 while orders.go_on():
                     first = found["prefixes"]
-                    one.sendall(
+                    one.connection.sendall(
                         b"".join(b"\x00\x09\x01" + struct.pack(">Q", n) for n in range(first, first + 1000))
                     )
                     found["prefixes"] += 1000
