@@ -15,7 +15,7 @@ from shmmap.daemon.config import DaemonConfig
 from shmmap.doctor.store_probe import StoreAnswer, StoreQuestion, ask_store
 from shmmap.errors import ShmmapError
 from shmmap.statistics.identity import DaemonIdentity
-from shmmap.statistics.snapshot import Snapshot
+from shmmap.statistics.reader import Snapshot
 
 __all__ = ["Diagnosis", "Machine", "answering_at"]
 
