@@ -121,11 +121,16 @@ def slice_of_shards(root: Root, slices: int) -> NDArray[np.int64]:
     return found
 
 
-class PartFields(msgspec.Struct, frozen=True):
-    """The MessagePack map of a part, in this order of keys."""
+class _Head(msgspec.Struct, frozen=True):
+    """The fields that show whether the rest of a part can be read."""
 
     format: str
     min_reader: int
+
+
+class PartFields(_Head, frozen=True):
+    """The MessagePack map of a part: those of `_Head`, and then these, in this order of keys."""
+
     version: int
     root_content: bytes
     slice: int
@@ -135,13 +140,6 @@ class PartFields(msgspec.Struct, frozen=True):
     shard_cells: bytes
     shard_bytes: bytes
     shard_sha256: bytes
-
-
-class _Head(msgspec.Struct, frozen=True):
-    """The fields that show whether the rest of a part can be read."""
-
-    format: str
-    min_reader: int
 
 
 # created at import: msgspec crashes the process if two threads decode a type for the first time at once
