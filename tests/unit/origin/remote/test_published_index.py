@@ -146,23 +146,6 @@ def test_golden_bytes_of_a_shard() -> None:
     assert pack_shard(shard_of()) == GOLDEN_SHARD
 
 
-def test_a_shard_says_what_each_cell_is() -> None:
-    root = unpack_root(framed(pack_root(root_of(ONE_FRAME))))
-    shard = unpack_shard(ONE_FRAME, root, 0)
-    assert len(shard) == 2
-    assert shard.id(1, root.id_prefix) == "/town/b/0_0.pcd"
-    assert shard.box(0) == (0.0, 0.0, 20.0, 20.0)
-    assert shard.points.tolist() == [5, 0]
-    assert shard.z[0].tolist() == [-1.5, 2.25]
-    name = shard.layers[NDT].name(1)
-    assert (name.sha256, name.size, name.raw) == (bytes(range(132, 164)), 2000, 4096)
-    assert name.content == bytes(range(196, 228))
-    assert name.path == "blobs/sha256/" + bytes(range(132, 164)).hex()
-    identity = shard.identity(0, root)
-    assert (identity.cell_id, identity.frame_id) == ("/town/-20_0.pcd", "map")
-    assert identity.stamp == bytes(range(64, 88))
-
-
 def test_versions_follow_from_content_not_from_names_of_objects() -> None:
     stamp = bytes(range(64, 88))
     version = ONE.version(0, "/town/")

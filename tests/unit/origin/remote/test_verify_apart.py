@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from shmmap.errors import BadRequest, ConfigError, MapDataError, ShmmapError
+from shmmap.errors import ConfigError, MapDataError, ShmmapError
 from shmmap.origin.remote.store import may_be_plain
 from shmmap.origin.remote.verify_apart import VerifySettings, read_trusted_root, verify_apart
 
@@ -65,16 +65,6 @@ def test_which_maps_may_be_read_over_plain_http() -> None:
     for url in ("s3://maps/town", "az://maps/town", "/srv/map", "file:///srv/map"):
         assert not may_be_plain(url, insecure_http=False, trust="ROOT.json")
         assert may_be_plain(url, insecure_http=True, trust="ROOT.json")
-
-
-def test_a_refusal_of_plain_http_says_what_to_do() -> None:
-    pytest.importorskip("obstore", reason="obstore is not installed")
-    from shmmap.origin.remote.opened_store import open_store
-
-    with pytest.raises(BadRequest, match="plain http") as caught:
-        open_store("http://store.invalid/map")
-    assert "--trust ROOT.json where the map is signed" in caught.value.hint
-    open_store("http://store.invalid/map", insecure_http=True)  # nothing is asked of it yet
 
 
 def test_an_offer_is_judged_by_the_latest_time_seen(tmp_path: Path) -> None:
