@@ -29,7 +29,6 @@ from shmmap.origin.remote.published_index import (  # noqa: E402
     pack_root,
     pack_shard,
     published_layer_version,
-    shard_keys,
     unpack_root,
     unpack_shard,
 )
@@ -160,31 +159,6 @@ def test_versions_follow_from_content_not_from_names_of_objects() -> None:
 
 
 # --- areas --------------------------------------------------------------------------------------------
-
-
-def test_shards_near_an_area_have_all_cells_that_touch_it() -> None:
-    rng = np.random.default_rng(4)
-    for trial in range(30):
-        size = float(rng.choice([1.0, 7.5, 20.0]))
-        low = rng.integers(-90, 90, (300, 2)) * size / (1 + trial % 3)
-        boxes = np.hstack([low, low + rng.random((300, 2)) * size * (1 + 9 * (trial % 2))])
-        shard_m = float(rng.choice([2 * size, 10 * size]))
-        keys = shard_keys(boxes, shard_m)
-        present = np.array(sorted({tuple(key) for key in keys.astype(int).tolist()}), np.int32)
-        extents = boxes[:, 2:] - boxes[:, :2]
-        root = root_of(
-            b"", keys=present, shard_m=shard_m,
-            largest_m=tuple(extents.max(axis=0).tolist()),
-            bounds=(*boxes[:, :2].min(axis=0).tolist(), *boxes[:, 2:].max(axis=0).tolist()),
-        )  # fmt: skip
-        for _ in range(30):
-            x, y = rng.uniform(-100 * size, 100 * size, 2).tolist()
-            area = (x, y, x + rng.uniform(0, 30) * size, y + rng.uniform(0, 30) * size)
-            touches = (boxes[:, 0] <= area[2]) & (boxes[:, 2] >= area[0])
-            touches &= (boxes[:, 1] <= area[3]) & (boxes[:, 3] >= area[1])
-            needed = {tuple(key) for key in keys[touches].astype(int).tolist()}
-            found = root.shards_near(area)
-            assert needed <= {tuple(key) for key in root.keys[found].tolist()}
 
 
 def test_only_neighbours_are_asked_below_and_left() -> None:
