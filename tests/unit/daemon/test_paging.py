@@ -38,7 +38,6 @@ WEST, EAST = 0, 1
 PAGES = np.array([[-40.0, -40.0, 0.0, 40.0], [0.0, -40.0, 40.0, 40.0]])
 EVERYWHERE = m.BoxMessage(-35.0, -35.0, 35.0, 35.0)
 IN_THE_WEST = m.BoxMessage(-35.0, -35.0, -5.0, 35.0)
-IN_THE_EAST = m.BoxMessage(5.0, -35.0, 35.0, 35.0)
 LONG_S = 200.0
 HALO = "denoise"
 

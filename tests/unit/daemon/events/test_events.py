@@ -259,11 +259,10 @@ class Shown:
     """Keeps what would stand in the statistics."""
 
     def __init__(self) -> None:
-        self.rows: Sequence[LiveMapRow] = ()
         self.values: dict[str, int] = {}
 
     def show_live_maps(self, rows: Sequence[LiveMapRow]) -> None:
-        self.rows = rows
+        """Show nothing."""
 
     def set(self, name: str, value: int) -> None:
         self.values[name] = value
