@@ -26,8 +26,7 @@ from shmmap.publishing.messages import (
     TASKS_AHEAD,
     CellSent,
     NotSent,
-    PublishSettings,
-    SliceSettings,
+    WorkerSettings,
     decode_sent,
 )
 
@@ -106,7 +105,7 @@ def absent_objects(
 
 def run_workers(
     module: str,
-    settings: PublishSettings | SliceSettings,
+    settings: WorkerSettings,
     tasks: Iterator[CellTask],
     workers: int,
     *,

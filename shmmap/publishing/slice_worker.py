@@ -27,7 +27,6 @@ from shmmap.layers.points import LAYER
 from shmmap.layers.sources import CellJob, CellSource, read_segment
 from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.origin.remote.object_tier import KeptObjects, ObjectTier
-from shmmap.origin.remote.opened_store import open_store
 from shmmap.origin.remote.published_object import (
     CellIdentity,
     ObjectName,
@@ -168,11 +167,7 @@ def _tasks(channel: socket.socket, begin: Callable[[CellTask], None]) -> Iterato
 
 def _work(channel: socket.socket, argument: str) -> None:
     settings = msgspec.json.decode(argument, type=SliceSettings)
-    store = open_store(
-        settings.url,
-        insecure_http=settings.insecure_http,
-        instance_credentials=settings.instance_credentials,
-    )
+    store = settings.open_store()
     cache = tier = None
     if settings.cache_bytes:
         cache = LayerCache(settings.cache_dir, limit_bytes=settings.cache_bytes)
