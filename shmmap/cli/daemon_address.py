@@ -14,7 +14,7 @@ from shmmap.segment.names import usual_directory
 if TYPE_CHECKING:
     from shmmap.client.client import Client
     from shmmap.statistics.identity import DaemonIdentity
-    from shmmap.statistics.snapshot import Snapshot
+    from shmmap.statistics.reader import Snapshot
 
 __all__ = ["connect", "endpoint", "has_lost_socket", "instance", "locate", "shm_dir", "snapshot"]
 

@@ -14,10 +14,10 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 from shmmap.daemon.config import DaemonConfig
-from shmmap.daemon.events.log import EventPublisher, events_path
+from shmmap.daemon.events.log import event_listener, events_path
 from shmmap.daemon.host.instance import InstanceLock, make_runtime_dir, take_away
 from shmmap.daemon.host.scheduling import SERVING_SLICE_NS, take_slices
 from shmmap.daemon.host.signals import (
@@ -42,7 +42,7 @@ from shmmap.daemon.requests.operators.operator_requests import Authorization, Op
 from shmmap.daemon.requests.paging import Paging
 from shmmap.daemon.service_manager import ActivatedSocket, ServiceManager, status_line
 from shmmap.daemon.serving_loop import BackgroundTask, ServingLoop
-from shmmap.daemon.telemetry.sampler import PublishedGauges, Sampler, VersionInService
+from shmmap.daemon.telemetry.sampler import PublishedGauges, Sampler
 from shmmap.daemon.transport.connection import Connections, Listener
 from shmmap.daemon.transport.inbox import Inbox
 from shmmap.daemon.transport.socket_file import SocketFile
@@ -53,34 +53,14 @@ from shmmap.protocol.codec import MAX_REQUEST_BYTES
 from shmmap.protocol.events import Epoch
 
 if TYPE_CHECKING:
-    from shmmap.daemon.map.catalogue_view import CatalogueView
-    from shmmap.daemon.map.object_keeper import ObjectKeeper
-    from shmmap.daemon.map.origin_link import OriginLink
+    from shmmap.daemon.map.published_origin import PublishedOrigin
 
-__all__ = ["Elsewhere", "Service"]
+__all__ = ["Service"]
 
 LOOK_S: Final = 1.0
 """Interval of checking whether the sockets' files still exist."""
 LAST_WORDS_S: Final = 0.2
 """Time for delivering the last messages when the daemon stops."""
-
-
-class Elsewhere(VersionInService, Protocol):
-    """A remote origin."""
-
-    @property
-    def link(self) -> OriginLink:
-        """Link to the origin: whether it is reachable, and has another version."""
-
-    @property
-    def keeper(self) -> ObjectKeeper | None:
-        """Keeps objects of cells on the disk ahead of use; None without a disk cache."""
-
-    def note_served(self, view: CatalogueView) -> None:
-        """Record which version of the map is served now."""
-
-    def try_again(self) -> None:
-        """Fetch the missing pages of the list of cells again."""
 
 
 class Service:
@@ -104,7 +84,7 @@ class Service:
         signals: StartSignals,
         activated: ActivatedSocket | None,
         lock: InstanceLock | None = None,
-        elsewhere: Elsewhere | None = None,
+        elsewhere: PublishedOrigin | None = None,
     ) -> None:
         self._config = config
         self._memory = memory
@@ -208,7 +188,7 @@ class Service:
             memory.event_log,
         )
 
-    def _tasks_of(self, elsewhere: Elsewhere) -> Iterator[tuple[str, BackgroundTask]]:
+    def _tasks_of(self, elsewhere: PublishedOrigin) -> Iterator[tuple[str, BackgroundTask]]:
         """Yield the background tasks that a remote origin needs."""
         from shmmap.daemon.loading.outages import OriginWatch
 
@@ -274,10 +254,10 @@ class Service:
         self._sockets.append((requests, listener))
         step("daemon.bind")
         events = SocketFile(events_path(self._socket_path), self._gid)
-        publisher = EventPublisher(
+        listener = event_listener(
             events.socket, memory.watched, self._connections, memory.statistics, memory.event_log
         )
-        self._sockets.append((events, publisher.listener))
+        self._sockets.append((events, listener))
         for _file, one in self._sockets:
             one.begin()
 

@@ -21,7 +21,7 @@ from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.config_live import LiveSettings, live_directory
 from shmmap.daemon.events.log import EventLog
-from shmmap.daemon.host.memory import choose_budget, loader_bytes, memory_limit_bytes, mounts
+from shmmap.daemon.host.memory import choose_budget, loader_bytes, memory_limit_bytes, mount_of
 from shmmap.daemon.live.messages import Begin
 from shmmap.daemon.loading.adoption import Adoption
 from shmmap.daemon.loading.prepared_parent import Early, PreparedParent
@@ -136,11 +136,8 @@ def place_live_maps(
 
 def _huge_pages(path: str) -> str | None:
     """Return the mount option that gives a directory huge pages; None if it has none."""
-    below = os.path.realpath(path) + "/"
-    around = [mount for mount in mounts() if below.startswith(mount.point.rstrip("/") + "/")]
-    if not around:
-        return None
-    options = max(reversed(around), key=lambda mount: len(mount.point)).options
+    mount = mount_of(path)
+    options = mount.options if mount is not None else []
     huge = next((option for option in options if option.startswith("huge=")), "huge=never")
     return None if huge in ("huge=never", "huge=advise") else huge
 

@@ -21,8 +21,7 @@ from shmmap.demo.consumer import TASKS, Pose, Step, StepReport
 from shmmap.demo.program import Program, Progress, cpu_seconds, descendants, process_memory
 from shmmap.errors import NoAnswer
 from shmmap.quantities import format_bytes, format_duration
-from shmmap.statistics.reader import read_statistics
-from shmmap.statistics.snapshot import Snapshot
+from shmmap.statistics.reader import Snapshot, read_statistics
 from shmmap.testing.daemon_process import DaemonProcess
 
 __all__ = ["DriveResult", "Fleet", "OutageResult", "drive", "drive_through_outage", "statistics_now"]

@@ -16,7 +16,7 @@ from shmmap.doctor.store_probe import StoreAnswer, StoreQuestion, ask_store
 from shmmap.errors import ShmmapError
 from shmmap.origin.remote.store import is_published, is_url
 from shmmap.statistics.identity import DaemonIdentity
-from shmmap.statistics.snapshot import Snapshot
+from shmmap.statistics.reader import Snapshot
 
 __all__ = ["ANSWER_S", "Diagnosis", "Machine", "answering_at"]
 

@@ -27,7 +27,6 @@ __all__ = [
     "UNKNOWN_FRAME",
     "DividedMap",
     "MapFrame",
-    "_frame_of",
     "far_cells_notes",
     "read_map_frame",
     "read_report",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Common parts of requests for cells: the area, the client's intent, and the cells it holds already."""
+"""Common parts of messages: the request's id, areas, the client's intent, and the cells it holds already."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ __all__ = [
     "HeldCell",
     "Intent",
     "LiveArea",
+    "Message",
     "SphereMessage",
     "SquareMessage",
     "area_from_message",
@@ -30,8 +31,14 @@ MAX_VERTICES: Final = 4096
 """Most vertices of a route in a message; the daemon uses only the first ones."""
 
 
-class CircleMessage(msgspec.Struct, array_like=True, tag="circle", frozen=True):
-    """True circle; without a z range if its bounds are nil."""
+class Message(msgspec.Struct, array_like=True):
+    """A request or a reply; ``request`` is the id that the client chose for the request."""
+
+    request: int
+
+
+class _Round(msgspec.Struct, array_like=True, frozen=True):
+    """Fields of areas around a place; without a z range if its bounds are nil."""
 
     x: float
     y: float
@@ -40,14 +47,12 @@ class CircleMessage(msgspec.Struct, array_like=True, tag="circle", frozen=True):
     z_max: float | None = None
 
 
-class SquareMessage(msgspec.Struct, array_like=True, tag="square", frozen=True):
+class CircleMessage(_Round, tag="circle", frozen=True):
+    """True circle."""
+
+
+class SquareMessage(_Round, tag="square", frozen=True):
     """Autoware's square of half-side ``radius``."""
-
-    x: float
-    y: float
-    radius: float
-    z_min: float | None = None
-    z_max: float | None = None
 
 
 class BoxMessage(msgspec.Struct, array_like=True, tag="box", frozen=True):

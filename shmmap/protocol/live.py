@@ -10,7 +10,7 @@ from typing import Annotated, Final, TypeAlias
 
 import msgspec
 
-from shmmap.protocol.areas import LiveArea
+from shmmap.protocol.areas import LiveArea, Message
 from shmmap.protocol.rows import LiveMapRow
 
 __all__ = [
@@ -48,32 +48,28 @@ Point: TypeAlias = tuple[float, float, float]
 Key: TypeAlias = tuple[int, int, int]
 
 
-class LiveList(msgspec.Struct, array_like=True, tag="live_list"):
+class LiveList(Message, tag="live_list"):
     """List the live maps and their state."""
 
-    request: int
 
-
-class LiveOpen(msgspec.Struct, array_like=True, tag="live_open"):
+class LiveOpen(Message, tag="live_open"):
     """Use a live map; with the name of a ``mapper`` send scans to it, too.
 
     ``frame_id`` is the frame in which the client works; empty: the map's own.
     """
 
-    request: int
     map: Name
     mapper: Name = ""
     frame_id: Name = ""
 
 
-class LiveScan(msgspec.Struct, array_like=True, tag="live_scan"):
+class LiveScan(Message, tag="live_scan"):
     """Apply a scan: its marks are in the file ``marks`` of the marks directory, ``bytes`` long.
 
     ``mapper`` is the number from `LiveOpened`; ``scan`` increases with each scan.  ``sensor`` is the sensor's
     position, which the window of chunks in memory follows.
     """
 
-    request: int
     map: Name
     mapper: int
     scan: int
@@ -82,29 +78,26 @@ class LiveScan(msgspec.Struct, array_like=True, tag="live_scan"):
     sensor: Point
 
 
-class LiveMove(msgspec.Struct, array_like=True, tag="live_move"):
+class LiveMove(Message, tag="live_move"):
     """Set the client's position: chunks around it stay in memory."""
 
-    request: int
     map: Name
     position: Point
 
 
-class LiveSave(msgspec.Struct, array_like=True, tag="live_save"):
+class LiveSave(Message, tag="live_save"):
     """Save all chunks now; answered when all previously applied scans are durable."""
 
-    request: int
     map: Name
 
 
-class LiveChunks(msgspec.Struct, array_like=True, tag="live_chunks"):
+class LiveChunks(Message, tag="live_chunks"):
     """List the chunks in memory, with ``saved`` also the chunks that are only on disk.
 
     ``since`` is a `LiveChunkPage.change`: only later changes are listed.  ``after`` is the last key of the
     previous page.
     """
 
-    request: int
     map: Name
     area: LiveArea | None = None
     since: int = 0
@@ -112,14 +105,13 @@ class LiveChunks(msgspec.Struct, array_like=True, tag="live_chunks"):
     after: Key | None = None
 
 
-class LiveVoxels(msgspec.Struct, array_like=True, tag="live_voxels"):
+class LiveVoxels(Message, tag="live_voxels"):
     """List the ``occupied`` or ``free`` voxels of an area, in a separate segment.
 
     ``scope`` is ``memory``, ``disk`` or ``all``; ``since`` as in `LiveChunks`: only voxels of chunks that
     changed after it.
     """
 
-    request: int
     map: Name
     kind: Name = "occupied"
     area: LiveArea | None = None
@@ -127,10 +119,9 @@ class LiveVoxels(msgspec.Struct, array_like=True, tag="live_voxels"):
     since: int = 0
 
 
-class LiveRelease(msgspec.Struct, array_like=True, tag="live_release"):
+class LiveRelease(Message, tag="live_release"):
     """Release the segment of a `LiveVoxelsReply`, which the client has read or does not need."""
 
-    request: int
     map: Name
     segment: str
 
@@ -143,14 +134,13 @@ LIVE_REQUESTS: Final = (
 )  # fmt: skip
 
 
-class LiveListed(msgspec.Struct, array_like=True, tag="live_listed"):
+class LiveListed(Message, tag="live_listed"):
     """Answer to `LiveList`."""
 
-    request: int
     maps: tuple[LiveMapRow, ...]
 
 
-class LiveOpened(msgspec.Struct, array_like=True, tag="live_opened"):
+class LiveOpened(Message, tag="live_opened"):
     """Answer to `LiveOpen`.
 
     Attributes
@@ -175,7 +165,6 @@ class LiveOpened(msgspec.Struct, array_like=True, tag="live_opened"):
         At least all scans of the mapper up to this number are in the map.
     """
 
-    request: int
     map_id: bytes
     resolution: float
     frame_id: str
@@ -195,25 +184,22 @@ class LiveOpened(msgspec.Struct, array_like=True, tag="live_opened"):
     applied: int = 0
 
 
-class LiveApplied(msgspec.Struct, array_like=True, tag="live_applied"):
+class LiveApplied(Message, tag="live_applied"):
     """Answer to `LiveScan`: the scan is applied; the mapper's scans up to ``durable`` are on disk."""
 
-    request: int
     scan: int
     durable: int
 
 
-class LiveMoved(msgspec.Struct, array_like=True, tag="live_moved"):
+class LiveMoved(Message, tag="live_moved"):
     """Answer to `LiveMove`; ``change`` as in `LiveChunkPage`."""
 
-    request: int
     change: int
 
 
-class LiveDurable(msgspec.Struct, array_like=True, tag="live_durable"):
+class LiveDurable(Message, tag="live_durable"):
     """Answer to `LiveSave`; all scans of the session's mapper up to ``scan`` are on disk."""
 
-    request: int
     scan: int
     files: int
 
@@ -235,7 +221,7 @@ class LiveChunkRow(msgspec.Struct, array_like=True, frozen=True, gc=False):
     bytes: int
 
 
-class LiveChunkPage(msgspec.Struct, array_like=True, tag="live_chunk_page"):
+class LiveChunkPage(Message, tag="live_chunk_page"):
     """Answer to `LiveChunks`, in the order of keys; ``more`` is false on the last page.
 
     ``change`` is the number of the map's last change: send it as ``since`` to get later changes.  ``gone``
@@ -243,7 +229,6 @@ class LiveChunkPage(msgspec.Struct, array_like=True, tag="live_chunk_page"):
     ``since``, and the reply lists everything instead.
     """
 
-    request: int
     change: int
     rows: tuple[LiveChunkRow, ...]
     more: bool = False
@@ -251,23 +236,20 @@ class LiveChunkPage(msgspec.Struct, array_like=True, tag="live_chunk_page"):
     since_known: bool = True
 
 
-class LiveVoxelsReply(msgspec.Struct, array_like=True, tag="live_voxels_reply"):
+class LiveVoxelsReply(Message, tag="live_voxels_reply"):
     """Answer to `LiveVoxels`: the segment with ``count`` voxels.
 
     The segment's columns are ``voxel`` (3 x int32, indices) and ``log_odds`` (int16).
     """
 
-    request: int
     change: int
     segment: str
     count: int
     bytes: int
 
 
-class LiveReleased(msgspec.Struct, array_like=True, tag="live_released"):
+class LiveReleased(Message, tag="live_released"):
     """Answer to `LiveRelease`."""
-
-    request: int
 
 
 LiveReply: TypeAlias = (

@@ -19,6 +19,7 @@ from shmmap.protocol.areas import (
     CircleMessage,
     HeldCell,
     Intent,
+    Message,
     SquareMessage,
     area_from_message,
     area_to_message,
@@ -86,56 +87,52 @@ Layers: TypeAlias = Annotated[tuple[str, ...], msgspec.Meta(max_length=MAX_LAYER
 Held: TypeAlias = Annotated[tuple[HeldCell, ...], msgspec.Meta(max_length=MAX_NAMES)]
 
 
-class Hello(msgspec.Struct, array_like=True, tag="hello"):
+class Hello(Message, tag="hello"):
     """First message of a session.
 
     ``session`` is the number of the client's session with a previous run of the daemon, 0 for none.  The new
     session gets the same number, so that the client's locks on segments stay valid.
     """
 
-    request: int
     major: int
     minor: int
     client: str = ""
     session: int = 0
 
 
-class Metadata(msgspec.Struct, array_like=True, tag="metadata"):
+class Metadata(Message, tag="metadata"):
     """Request one page of the catalogue.
 
     ``since`` is a map version: the reply lists only later changes, if the daemon still knows that version
     (`MetadataPage.since_known`).  ``start`` is `MetadataPage.next` of the previous page.
     """
 
-    request: int
     area: AreaMessage | None = None
     since: int | None = None
     start: int = 0
     limit: int = 1000
 
 
-class Area(msgspec.Struct, array_like=True, tag="area"):
+class Area(Message, tag="area"):
     """Request cells that touch an area.
 
     ``wait`` is how many seconds the reply may wait for loads; with nil the daemon answers at once with the
     resident cells, and lists the others as pending.
     """
 
-    request: int
     area: AreaMessage
     layers: Layers = ("points",)
     wait: float | None = None
     intent: Intent | None = None
 
 
-class Differential(msgspec.Struct, array_like=True, tag="differential"):
+class Differential(Message, tag="differential"):
     """Request cells that touch an area, minus those that the client holds.
 
     ``held`` names cells one by one; ``packed`` is the same as versions alone, 8 bytes little-endian
     each: a version names one layer of one cell.
     """
 
-    request: int
     area: AreaMessage
     layers: Layers = ("points",)
     held: Held = ()
@@ -144,74 +141,60 @@ class Differential(msgspec.Struct, array_like=True, tag="differential"):
     intent: Intent | None = None
 
 
-class Selected(msgspec.Struct, array_like=True, tag="selected"):
+class Selected(Message, tag="selected"):
     """Request cells by id; the reply keeps order and duplicates."""
 
-    request: int
     ids: Ids
     layers: Layers = ("points",)
     wait: float | None = None
     intent: Intent | None = None
 
 
-class Release(msgspec.Struct, array_like=True, tag="release"):
+class Release(Message, tag="release"):
     """Report that the client unmapped these versions (8 bytes little-endian each; nil: all)."""
 
-    request: int
     packed: bytes | None = None
 
 
-class Stats(msgspec.Struct, array_like=True, tag="stats"):
+class Stats(Message, tag="stats"):
     """Request counters, sessions, and the use of the budget."""
 
-    request: int
 
-
-class Show(msgspec.Struct, array_like=True, tag="show"):
+class Show(Message, tag="show"):
     """Request all data about one cell: versions, segments, their holders, last failure."""
 
-    request: int
     id: str
 
 
-class Reload(msgspec.Struct, array_like=True, tag="reload"):
+class Reload(Message, tag="reload"):
     """Read the map's catalogue again (privileged)."""
 
-    request: int
 
-
-class Evict(msgspec.Struct, array_like=True, tag="evict"):
+class Evict(Message, tag="evict"):
     """Retire cells, all when ``ids`` is nil (privileged); those in use are freed when they are released."""
 
-    request: int
     ids: Ids | None = None
 
 
-class Pin(msgspec.Struct, array_like=True, tag="pin"):
+class Pin(Message, tag="pin"):
     """Keep cells resident until `Unpin` or the daemon's end (privileged); no ids: only list the pins."""
 
-    request: int
     ids: Ids = ()
     layers: Layers = ("points",)
 
 
-class Unpin(msgspec.Struct, array_like=True, tag="unpin"):
+class Unpin(Message, tag="unpin"):
     """Remove pins from cells, from all when ``ids`` is nil (privileged)."""
 
-    request: int
     ids: Ids | None = None
 
 
-class Shutdown(msgspec.Struct, array_like=True, tag="shutdown"):
+class Shutdown(Message, tag="shutdown"):
     """End the daemon and free its memory, as SIGTERM does (privileged)."""
 
-    request: int
 
-
-class Bye(msgspec.Struct, array_like=True, tag="bye"):
+class Bye(Message, tag="bye"):
     """End the session; there is no reply.  Segments that the client still maps stay in use."""
-
-    request: int
 
 
 Request: TypeAlias = (
@@ -234,7 +217,7 @@ Request: TypeAlias = (
 )
 
 
-class Welcome(msgspec.Struct, array_like=True, tag="welcome"):
+class Welcome(Message, tag="welcome"):
     """Answer to `Hello`.
 
     ``session`` is the slot the client locks in every segment it opens.  Cell ids in replies are relative to
@@ -243,7 +226,6 @@ class Welcome(msgspec.Struct, array_like=True, tag="welcome"):
     that the map was made of.
     """
 
-    request: int
     major: int
     minor: int
     daemon: str
@@ -309,7 +291,7 @@ class FailedCell(msgspec.Struct, array_like=True, frozen=True):
     box: tuple[float, float, float, float] | None = None
 
 
-class Cells(msgspec.Struct, array_like=True, tag="cells"):
+class Cells(Message, tag="cells"):
     """Answer to `Area`, `Differential` and `Selected`.
 
     ``removed`` repeats held ids that the client should drop, in the client's order; ``removed_packed`` does
@@ -319,7 +301,6 @@ class Cells(msgspec.Struct, array_like=True, tag="cells"):
     being fetched.
     """
 
-    request: int
     epoch: int
     map_version: int
     cells: tuple[Handle, ...] = ()
@@ -346,7 +327,7 @@ class MetadataRow(msgspec.Struct, array_like=True, frozen=True, gc=False):
     z_max: float | None = None
 
 
-class MetadataPage(msgspec.Struct, array_like=True, tag="metadata_page"):
+class MetadataPage(Message, tag="metadata_page"):
     """Answer to `Metadata`; ``next`` is nil on the last page.
 
     ``since_known`` is false if the daemon no longer knew ``since``, and the reply contains the whole list
@@ -354,7 +335,6 @@ class MetadataPage(msgspec.Struct, array_like=True, tag="metadata_page"):
     page contains it.
     """
 
-    request: int
     epoch: int
     map_version: int
     rows: tuple[MetadataRow, ...]
@@ -363,16 +343,13 @@ class MetadataPage(msgspec.Struct, array_like=True, tag="metadata_page"):
     removed: tuple[str, ...] = ()
 
 
-class Released(msgspec.Struct, array_like=True, tag="released"):
+class Released(Message, tag="released"):
     """Answer to `Release`."""
 
-    request: int
 
-
-class StatsReply(msgspec.Struct, array_like=True, tag="stats_reply"):
+class StatsReply(Message, tag="stats_reply"):
     """Answer to `Stats`: counters by name, sessions, segments in use by processes without a session."""
 
-    request: int
     epoch: int
     map_version: int
     counters: dict[str, int]
@@ -381,13 +358,12 @@ class StatsReply(msgspec.Struct, array_like=True, tag="stats_reply"):
     unknown_bytes: int = 0
 
 
-class ShownCell(msgspec.Struct, array_like=True, tag="shown_cell"):
+class ShownCell(Message, tag="shown_cell"):
     """Answer to `Show`; ``id`` is complete, ``failure`` is the last failure if it still applies.
 
     ``pinned`` names the layers that an operator keeps resident.
     """
 
-    request: int
     id: str
     version: int
     min_x: float
@@ -403,10 +379,9 @@ class ShownCell(msgspec.Struct, array_like=True, tag="shown_cell"):
     pinned: tuple[str, ...] = ()
 
 
-class Reloaded(msgspec.Struct, array_like=True, tag="reloaded"):
+class Reloaded(Message, tag="reloaded"):
     """Answer to `Reload`: how many cells changed, were added and were removed; warnings."""
 
-    request: int
     map_version: int
     changed: int
     added: int
@@ -414,13 +389,12 @@ class Reloaded(msgspec.Struct, array_like=True, tag="reloaded"):
     problems: tuple[str, ...] = ()
 
 
-class Evicted(msgspec.Struct, array_like=True, tag="evicted"):
+class Evicted(Message, tag="evicted"):
     """Answer to `Evict`: segments freed at once, segments still mapped, unknown ids.
 
     ``kept`` counts the segments left alone because an operator pinned them.
     """
 
-    request: int
     freed: int
     pinned: int
     unknown: tuple[str, ...] = ()
@@ -436,24 +410,20 @@ class PinnedCell(msgspec.Struct, array_like=True, frozen=True):
     bytes: int
 
 
-class Pinned(msgspec.Struct, array_like=True, tag="pinned"):
+class Pinned(Message, tag="pinned"):
     """Answer to `Pin` and `Unpin`: the requested cells, else all pinned ones; and unknown ids."""
 
-    request: int
     cells: tuple[PinnedCell, ...]
     unknown: tuple[str, ...] = ()
 
 
-class Stopping(msgspec.Struct, array_like=True, tag="stopping"):
+class Stopping(Message, tag="stopping"):
     """Answer to `Shutdown`: the daemon ends now."""
 
-    request: int
 
-
-class ErrorReply(msgspec.Struct, array_like=True, tag="error"):
+class ErrorReply(Message, tag="error"):
     """The request as a whole was refused; code ``no_session`` requires a new `Hello`."""
 
-    request: int
     code: str
     message: str
     hint: str = ""

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,9 +25,10 @@ from shmmap.origin.map_report import REPORT_HEAD, REPORT_NAME, UNKNOWN_FRAME, Ma
 from shmmap.origin.metadata import METADATA_NAME, metadata_text
 from shmmap.origin.remote.map_versions import Current, read_entry, read_root, read_shards, require_current
 from shmmap.origin.remote.object_tier import KeptObjects, ObjectTier
-from shmmap.origin.remote.published_index import Root, Shard
-from shmmap.origin.remote.published_object import POINTS, ObjectName, read_bare_header, rows_of, unpack_object
+from shmmap.origin.remote.published_index import Root
+from shmmap.origin.remote.published_object import POINTS, ObjectName, read_bare_header, rows_of
 from shmmap.origin.remote.store import Store
+from shmmap.origin.remote.zstd_frame import unpack_frame
 
 __all__ = ["FetchedMap", "fetch_map"]
 
@@ -60,11 +60,6 @@ class FetchedMap:
     points: int
     fetched_cells: int
     fetched_bytes: int
-
-
-class _Cell(NamedTuple):
-    name: str
-    object: ObjectName
 
 
 def fetch_map(
@@ -156,9 +151,10 @@ class _Fetch:
         with ThreadPoolExecutor(_CONCURRENT_FETCHES, "fetch") as pool:
             for shard in read_shards(self._pages, self._root):
                 boxes.append(shard.boxes)
-                names += (name.decode() for name in shard.names)
+                names += (here := [name.decode() for name in shard.names])
                 counts.points += int(shard.points.sum(dtype=np.uint64))
-                for is_new in pool.map(self._fetch, _cells_of(shard)):
+                objects = map(shard.layers[POINTS].name, range(len(shard)))
+                for is_new in pool.map(self._fetch, here, objects):
                     counts.cells += is_new
                     progress.advance(1)
         counts.bytes = self._objects.counts.fetched_bytes
@@ -166,16 +162,16 @@ class _Fetch:
         self._write_report()
         return counts
 
-    def _fetch(self, cell: _Cell) -> bool:
+    def _fetch(self, name: str, source: ObjectName) -> bool:
         """Write a cell's file; return False if it exists already."""
-        path = os.path.join(self._cells_dir, cell.name)
+        path = os.path.join(self._cells_dir, name)
         if os.path.exists(path):  # a file gets its name only when it is complete
             return False
-        frame = self._objects.read(cell.object.sha256, cell.object.size)
-        unpacked = unpack_object(frame, cell.object, verified=True)
-        header = read_bare_header(unpacked, POINTS, name=f"{self._objects.url}/{cell.object.path}")
+        frame = self._objects.read(source.sha256, source.size)
+        unpacked = unpack_frame(frame, source.raw, name=source.path, exact=True)
+        header = read_bare_header(unpacked, POINTS, name=f"{self._objects.url}/{source.path}")
         if any(header.origin):
-            raise MapDataError("its coordinates have an origin of their own", path=cell.object.path)
+            raise MapDataError("its coordinates have an origin of their own", path=source.path)
         columns: dict[str, NDArray[Any]] = {
             column.name: rows_of(unpacked, column) for column in header.columns
         }
@@ -209,11 +205,6 @@ class _Fetch:
         report = {**REPORT_HEAD, "origin": frame.origin, "crs": frame.crs, "unit_m": frame.unit_m}
         with open(os.path.join(self._directory, REPORT_NAME), "w", encoding="utf-8") as file:
             json.dump(report, file, indent=2)
-
-
-def _cells_of(shard: Shard) -> Iterator[_Cell]:
-    objects = shard.layers[POINTS]
-    return (_Cell(name.decode(), objects.name(row)) for row, name in enumerate(shard.names))
 
 
 def _only_size(low: NDArray[np.float64], high: NDArray[np.float64]) -> float:

@@ -11,7 +11,6 @@ import time
 from collections.abc import Collection, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from hashlib import sha256
 from itertools import groupby
 from typing import TYPE_CHECKING, Final
 
@@ -27,7 +26,6 @@ from shmmap.origin.remote.map_versions import (
     read_shards,
 )
 from shmmap.origin.remote.published_index import Root, map_version_of, pack_root
-from shmmap.origin.remote.published_object import blob_path
 from shmmap.origin.remote.slice_part import (
     MAX_PART_BYTES,
     Part,
@@ -40,14 +38,13 @@ from shmmap.origin.remote.slice_part import (
     with_parts,
 )
 from shmmap.origin.remote.store import Store, refuse_read_only
-from shmmap.origin.remote.zstd_frame import pack_frame
 from shmmap.prepare.run import PrepareProgress
 from shmmap.publishing.new_version import (
     CONCURRENT_REQUESTS,
     absent_objects,
     begin_version,
     refuse_if_late,
-    send_object,
+    send_packed,
     switch_version,
 )
 from shmmap.publishing.publish import packed_root
@@ -153,13 +150,11 @@ class _Join:
         unpacked = packed_root(root, self._store.url)
         if unpacked == pack_root(self._base.root):
             return self._unchanged(parts)
-        frame = pack_frame(unpacked)
-        digest = sha256(frame).digest()
         step("join.root")
-        send_object(self._store, blob_path(digest), frame)
+        sent = send_packed(self._store, unpacked)
         step("join.entry")
         # from here on pruning spares the version's objects; the check below finds those removed earlier
-        entry = new_entry(self._store, digest.hex(), len(frame), self._base.current)
+        entry = new_entry(self._store, sent.sha256.hex(), sent.size, self._base.current)
         objects = self._look_for_objects(root, layers)
         step("join.looked")
         refuse_if_late(self._began_s, f"joining at {self._store.url}", "run the same command again")

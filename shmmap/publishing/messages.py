@@ -14,8 +14,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from shmmap.origin.remote.opened_store import open_store
 from shmmap.origin.remote.published_index import LayerObjects
 from shmmap.origin.remote.published_object import ObjectName
+from shmmap.origin.remote.store import Store
 from shmmap.prepare.task_pool import Ready
 
 __all__ = [
@@ -26,6 +28,7 @@ __all__ = [
     "NotSent",
     "PublishSettings",
     "SliceSettings",
+    "WorkerSettings",
     "decode_sent",
     "write_known_objects",
 ]
@@ -35,8 +38,23 @@ TASKS_AHEAD: Final = 8
 """Cells assigned to a worker at a time, so that finished cells are sent while the next one is made."""
 
 
-class PublishSettings(msgspec.Struct, array_like=True):
-    """Settings of all workers of a run.
+class WorkerSettings(msgspec.Struct, array_like=True):
+    """Settings of all workers: where the store and the cache of layers are; empty: no cache."""
+
+    url: str
+    insecure_http: bool = False
+    instance_credentials: bool = False
+    cache_dir: str = ""
+
+    def open_store(self) -> Store:
+        """Return the store, see `shmmap.origin.remote.opened_store.open_store`."""
+        return open_store(
+            self.url, insecure_http=self.insecure_http, instance_credentials=self.instance_credentials
+        )
+
+
+class PublishSettings(WorkerSettings):
+    """Settings of all workers of a run; their cache may contain prepared layers.
 
     Attributes
     ----------
@@ -44,37 +62,27 @@ class PublishSettings(msgspec.Struct, array_like=True):
         File with the objects of the version before, see `KnownObjects`; empty: none.
     is_first
         Whether to send every object without first checking whether the store has it.
-    cache_dir
-        Directory of the cache that may contain prepared layers; empty: no cache.
     encoding
         One of `shmmap.origin.remote.published_index.ENCODINGS`; empty: that of the version before, or
         ``exact`` for the first version.
     """
 
-    url: str
-    insecure_http: bool = False
-    instance_credentials: bool = False
-    cache_dir: str = ""
     known: str = ""
     is_first: bool = False
     encoding: str = ""
 
 
-class SliceSettings(msgspec.Struct, array_like=True):
-    """Settings of all workers of a slice.
+class SliceSettings(WorkerSettings):
+    """Settings of all workers of a slice; computed layers are kept in the cache.
 
     Attributes
     ----------
-    cache_dir, cache_bytes
-        Directory that keeps computed layers, and its size limit in bytes; 0: none are kept.
+    cache_bytes
+        Size limit of the cache in bytes; 0: no layers are kept.
     keep_points
         Keep fetched points there, too, because several cells need them.
     """
 
-    url: str
-    insecure_http: bool = False
-    instance_credentials: bool = False
-    cache_dir: str = ""
     cache_bytes: int = 0
     keep_points: bool = False
 

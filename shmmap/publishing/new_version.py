@@ -10,7 +10,8 @@ import itertools
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor
-from typing import TYPE_CHECKING, Final
+from hashlib import sha256
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import msgspec
 
@@ -19,13 +20,13 @@ from shmmap.failpoints import step
 from shmmap.origin.remote.map_versions import CurrentState, Entry, add_version, read_current, refuse_if_signed
 from shmmap.origin.remote.published_object import blob_path
 from shmmap.origin.remote.store import Store
+from shmmap.origin.remote.zstd_frame import pack_frame
 from shmmap.prepare.task_pool import CellTask, TaskPool
 from shmmap.publishing.messages import (
     TASKS_AHEAD,
     CellSent,
     NotSent,
-    PublishSettings,
-    SliceSettings,
+    WorkerSettings,
     decode_sent,
 )
 
@@ -34,11 +35,13 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CONCURRENT_REQUESTS",
+    "SentObject",
     "absent_objects",
     "begin_version",
     "refuse_if_late",
     "run_workers",
     "send_object",
+    "send_packed",
     "switch_version",
 ]
 
@@ -64,6 +67,22 @@ def send_object(store: Store, path: str, frame: bytes, *, look: bool = True) -> 
     return True
 
 
+class SentObject(NamedTuple):
+    """An object of the store: its SHA-256 and size, and the number of bytes sent; 0: the store had it."""
+
+    sha256: bytes
+    size: int
+    sent_bytes: int
+
+
+def send_packed(store: Store, unpacked: bytes, *, look: bool = True) -> SentObject:
+    """Pack an object and send it as `send_object` does."""
+    frame = pack_frame(unpacked)
+    digest = sha256(frame).digest()
+    is_new = send_object(store, blob_path(digest), frame, look=look)
+    return SentObject(digest, len(frame), len(frame) * is_new)
+
+
 def absent_objects(
     store: Store, objects: Iterable[tuple[bytes, int]], threads: Executor, *, since_s: float = 0.0
 ) -> list[bytes]:
@@ -86,7 +105,7 @@ def absent_objects(
 
 def run_workers(
     module: str,
-    settings: PublishSettings | SliceSettings,
+    settings: WorkerSettings,
     tasks: Iterator[CellTask],
     workers: int,
     *,

@@ -38,9 +38,7 @@ from shmmap.origin.remote.published_index import (
     pack_root,
     pack_shard,
 )
-from shmmap.origin.remote.published_object import blob_path
 from shmmap.origin.remote.store import Store, refuse_read_only
-from shmmap.origin.remote.zstd_frame import pack_frame
 from shmmap.prepare.run import Failure, PrepareProgress, task_of
 from shmmap.prepare.task_pool import CellTask
 from shmmap.publishing.messages import CellSent, NotSent, PublishSettings, write_known_objects
@@ -48,7 +46,7 @@ from shmmap.publishing.new_version import (
     begin_version,
     refuse_if_late,
     run_workers,
-    send_object,
+    send_packed,
     switch_version,
 )
 from shmmap.publishing.shards import CellObjects, check_names, divide_into_shards, shard_side
@@ -327,11 +325,9 @@ class _Run:
         if self._before is not None and content == sha256(unpacked).digest():
             size = int(self._before.sizes[number])
             return _ShardRow(key, len(shard), size, self._before.shard_sha256(number)), 0
-        frame = pack_frame(unpacked)
-        digest = sha256(frame).digest()
         step("publish.shard")
-        is_new = send_object(self._store, blob_path(digest), frame, look=self._look)
-        return _ShardRow(key, len(shard), len(frame), digest), len(frame) * is_new
+        sent = send_packed(self._store, unpacked, look=self._look)
+        return _ShardRow(key, len(shard), sent.size, sent.sha256), sent.sent_bytes
 
     def _root(self, side: float, rows: list[_ShardRow]) -> Root:
         catalogue = self._catalogue
@@ -358,15 +354,14 @@ class _Run:
         )
 
     def _send_root(self, unpacked: bytes) -> Entry:
-        frame = pack_frame(unpacked)
-        digest = sha256(frame).digest()
-        self._result.root = digest.hex()
         step("publish.root")
-        self._count(len(frame) * send_object(self._store, blob_path(digest), frame, look=self._look))
+        root = send_packed(self._store, unpacked, look=self._look)
+        self._result.root = root.sha256.hex()
+        self._count(root.sent_bytes)
         refuse_if_late(
             self._began_s,
             f"publishing to {self._store.url}",
             "run the same command again: what was sent within a day is not sent again",
         )
         step("version.entry")
-        return new_entry(self._store, self._result.root, len(frame), self._seen.current)
+        return new_entry(self._store, self._result.root, root.size, self._seen.current)

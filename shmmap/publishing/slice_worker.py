@@ -7,6 +7,7 @@ Points of the next cells are fetched while a cell is made.  Cells are made and s
 
 from __future__ import annotations
 
+import contextlib
 import os
 import socket
 import sys
@@ -26,7 +27,6 @@ from shmmap.layers.points import LAYER
 from shmmap.layers.sources import CellJob, CellSource, read_segment
 from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.origin.remote.object_tier import KeptObjects, ObjectTier
-from shmmap.origin.remote.opened_store import open_store
 from shmmap.origin.remote.published_object import (
     CellIdentity,
     ObjectName,
@@ -152,39 +152,22 @@ class PublishedPoints:
         return held
 
 
-class _Tasks:
-    """Tasks of a worker; ``begin`` is called for the next tasks while a task is being worked on."""
-
-    def __init__(self, channel: socket.socket, begin: Callable[[CellTask], None]) -> None:
-        self._channel = channel
-        self._begin = begin
-
-    def __iter__(self) -> Iterator[CellTask]:
-        waiting: deque[CellTask] = deque()
-        while True:
-            while (data := self._receive(wait=not waiting)) is not None:
-                if not data:
-                    return
+def _tasks(channel: socket.socket, begin: Callable[[CellTask], None]) -> Iterator[CellTask]:
+    """Yield the tasks of a worker; ``begin`` is called for the next ones while a task is being worked on."""
+    waiting: deque[CellTask] = deque()
+    while True:
+        with contextlib.suppress(BlockingIOError):  # no further task has arrived yet
+            while data := channel.recv(MAX_PACKET_BYTES, socket.MSG_DONTWAIT if waiting else 0):
                 task = decode_task(data)
-                self._begin(task)
+                begin(task)
                 waiting.append(task)
-            yield waiting.popleft()
-
-    def _receive(self, *, wait: bool) -> bytes | None:
-        """Return the next packet; empty if the channel is closed, None if no packet has arrived yet."""
-        try:
-            return self._channel.recv(MAX_PACKET_BYTES, 0 if wait else socket.MSG_DONTWAIT)
-        except BlockingIOError:
-            return None
+            return
+        yield waiting.popleft()
 
 
 def _work(channel: socket.socket, argument: str) -> None:
     settings = msgspec.json.decode(argument, type=SliceSettings)
-    store = open_store(
-        settings.url,
-        insecure_http=settings.insecure_http,
-        instance_credentials=settings.instance_credentials,
-    )
+    store = settings.open_store()
     cache = tier = None
     if settings.cache_bytes:
         cache = LayerCache(settings.cache_dir, limit_bytes=settings.cache_bytes)
@@ -206,7 +189,7 @@ def _work(channel: socket.socket, argument: str) -> None:
                 near = {one.source: None for around in task.around for one in around}
                 points.begin([task.source, *near])
 
-        make_and_send(_Tasks(channel, begin), maker, sender, ending=_OF_THE_STORE)
+        make_and_send(_tasks(channel, begin), maker, sender, ending=_OF_THE_STORE)
 
 
 def _is_kept(task: CellTask, cache: LayerCache | None, points: PublishedPoints) -> bool:

@@ -39,7 +39,7 @@ from shmmap.origin.remote.published_index import (
     unpack_root,
     unpack_shard,
 )
-from shmmap.origin.remote.published_object import POINTS, STAMP_BYTES, LayerSource, blob_path, pack_source
+from shmmap.origin.remote.published_object import POINTS, STAMP_BYTES, LayerSource, pack_source
 from shmmap.origin.remote.slice_part import (
     MAX_PART_BYTES,
     MAX_SLICES,
@@ -52,11 +52,17 @@ from shmmap.origin.remote.slice_part import (
     with_parts,
 )
 from shmmap.origin.remote.store import Store, Tag, put_over, refuse_read_only
-from shmmap.origin.remote.zstd_frame import DAMAGED, pack_frame, unpack_frame
+from shmmap.origin.remote.zstd_frame import DAMAGED, unpack_frame
 from shmmap.prepare.run import Failure, PrepareProgress, task_of
 from shmmap.prepare.task_pool import CellTask
 from shmmap.publishing.messages import CellSent, NotSent, SliceSettings
-from shmmap.publishing.new_version import CONCURRENT_REQUESTS, absent_objects, run_workers, send_object
+from shmmap.publishing.new_version import (
+    CONCURRENT_REQUESTS,
+    SentObject,
+    absent_objects,
+    run_workers,
+    send_packed,
+)
 from shmmap.publishing.shards import CellObjects
 from shmmap.segment.version import Source
 
@@ -222,11 +228,6 @@ class _Making:
     left: int
 
 
-class _ShardRow(NamedTuple):
-    size: int
-    sha256: bytes
-
-
 class _Cells(Catalogue):
     """The cells of a shard and of the shards around it."""
 
@@ -291,7 +292,7 @@ class _Slice:
         self._first = root.first_indices
         self._held: OrderedDict[int, Shard] = OrderedDict()
         self._making: dict[int, _Making] = {}
-        self._rows: dict[int, _ShardRow] = {}
+        self._rows: dict[int, SentObject] = {}
         self._result = Sliced(
             base.current.version,
             run_of(base.content, names, slices),
@@ -315,7 +316,8 @@ class _Slice:
             self._make(workers)
         else:
             for number in self._numbers.tolist():
-                self._rows[number] = _ShardRow(int(self._root.sizes[number]), self._root.shard_sha256(number))
+                sha, size = self._root.shard_sha256(number), int(self._root.sizes[number])
+                self._rows[number] = SentObject(sha, size, 0)
         if not result.failures:
             self._put_part(path, tag)
             self._progress.done(result.cells)
@@ -456,7 +458,7 @@ class _Slice:
         """Return the number of the shard that contains a task's cell."""
         return int(np.searchsorted(self._first, task.number, side="right")) - 1
 
-    def _send_shard(self, making: _Making) -> _ShardRow:
+    def _send_shard(self, making: _Making) -> SentObject:
         shard = replace(making.shard, layers={**making.shard.layers, **making.objects.layers})
         unpacked = pack_shard(shard)
         if len(unpacked) > MAX_SHARD_BYTES:
@@ -466,11 +468,10 @@ class _Slice:
                 cause="too_large",
                 hint="publish the map with these layers in one go: shmmap publish MAP URL --layer ...",
             )
-        frame = pack_frame(unpacked)
-        digest = sha256(frame).digest()
         step("slice.shard")
-        self._count(len(frame) * send_object(self._store, blob_path(digest), frame))
-        return _ShardRow(len(frame), digest)
+        sent = send_packed(self._store, unpacked)
+        self._count(sent.sent_bytes)
+        return sent
 
     def _count(self, sent_bytes: int) -> None:
         self._result.sent_objects += sent_bytes > 0

@@ -26,7 +26,6 @@ from shmmap.layers.disk_cache import LayerCache
 from shmmap.layers.points import LAYER
 from shmmap.layers.sources import FILES, CellJob, CellSource, Files, SourceReader
 from shmmap.layers.spec import LayerSpec, layer_spec
-from shmmap.origin.remote.opened_store import open_store
 from shmmap.origin.remote.published_index import MILLIMETRES
 from shmmap.origin.remote.published_object import (
     MAX_OBJECT_BYTES,
@@ -256,11 +255,7 @@ class Sender:
 
 def _work(channel: socket.socket, argument: str) -> None:
     settings = msgspec.json.decode(argument, type=PublishSettings)
-    store = open_store(
-        settings.url,
-        insecure_http=settings.insecure_http,
-        instance_credentials=settings.instance_credentials,
-    )
+    store = settings.open_store()
     cache = LayerCache(settings.cache_dir, limit_bytes=1 << 62) if settings.cache_dir else None
     maker = CellMaker(KnownObjects(settings.known), cache, millimetres=settings.encoding == MILLIMETRES)
 

@@ -6,13 +6,14 @@ A process id may be reused; together with the process's start time it is unique.
 
 from __future__ import annotations
 
+import contextlib
 import os
 from dataclasses import dataclass, fields
 from typing import Final, Literal, TypeAlias
 
 from shmmap.errors import SegmentCorrupt
 
-__all__ = ["DaemonIdentity", "DaemonState", "WriterProcess", "judge", "pid_namespace", "start_time_ticks"]
+__all__ = ["DaemonIdentity", "DaemonState", "WriterProcess", "pid_namespace", "start_time_ticks"]
 
 DaemonState: TypeAlias = Literal["healthy", "starting", "stopped", "hung", "dead"]
 
@@ -20,15 +21,15 @@ HUNG_AFTER_S: Final = 5.0
 """Time without a beat after which a running daemon counts as hung."""
 
 
-def _stat_fields(pid: int) -> list[str]:
-    with open(f"/proc/{pid}/stat", "rb") as file:
-        text = file.read().decode("utf-8", "replace")
+def _stat_fields(stat: bytes) -> list[str]:
+    text = stat.decode("utf-8", "replace")
     return text[text.rindex(")") + 2 :].split()  # the command in front may contain spaces and brackets
 
 
 def start_time_ticks(pid: int) -> int:
     """Return when a process started, in clock ticks since boot (field 22 of ``/proc/PID/stat``)."""
-    return int(_stat_fields(pid)[19])
+    with open(f"/proc/{pid}/stat", "rb") as file:
+        return int(_stat_fields(file.read())[19])
 
 
 def pid_namespace() -> int:
@@ -116,28 +117,6 @@ class DaemonIdentity:
             raise SegmentCorrupt(f"the statistics' identity is damaged: {error}") from error
 
 
-def _process_state(pid: int, start_ticks: int) -> Literal["running", "stopped", "dead", "unknown"]:
-    """Return the kernel's state of the process with this id and start time.
-
-    ``unknown`` if /proc hides other users' processes.
-    """
-    try:
-        found = _stat_fields(pid)
-    except (FileNotFoundError, ProcessLookupError):
-        try:
-            os.kill(pid, 0)
-        except ProcessLookupError:
-            return "dead"
-        except PermissionError:
-            pass
-        return "unknown"
-    except PermissionError:
-        return "unknown"
-    if int(found[19]) != start_ticks or found[0] in "ZXx":
-        return "dead"
-    return "stopped" if found[0] in "Tt" else "running"
-
-
 class WriterProcess:
     """The process that writes the statistics, watched through one descriptor of ``/proc/PID/stat``.
 
@@ -148,58 +127,39 @@ class WriterProcess:
     def __init__(self, identity: DaemonIdentity) -> None:
         self._identity = identity
         self._fd = -1
-        self._elsewhere = identity.pid_namespace not in (0, pid_namespace())
-        if self._elsewhere:
-            return  # the pid is not valid in this namespace: only the beat counts
-        try:
-            fd = os.open(f"/proc/{identity.pid}/stat", os.O_RDONLY | os.O_CLOEXEC)
-        except OSError:
-            return
-        found = _read_stat(fd)
-        if (
-            found is not None
-            and int(found[found.rindex(b")") + 2 :].split()[19]) == identity.start_time_ticks
-        ):
-            self._fd = fd
-        else:
-            os.close(fd)
+        # in another namespace the pid is not valid: only the beat counts
+        self._is_visible = identity.pid_namespace in (0, pid_namespace())
+        if self._is_visible:
+            with contextlib.suppress(OSError):
+                self._fd = os.open(f"/proc/{identity.pid}/stat", os.O_RDONLY | os.O_CLOEXEC)
 
     def state(self, beat_age_s: float) -> DaemonState:
         """Return the daemon's state, given the age of its last beat in seconds."""
-        if self._fd < 0:
-            return judge(self._identity, beat_age_s)
-        found = _read_stat(self._fd)
-        if found is None:
+        letter = self._letter() if self._is_visible else ""
+        if letter and letter in "ZXx":
             return "dead"
-        letter = found[found.rindex(b")") + 2]
-        if letter in b"ZXx":
-            return "dead"
-        if letter in b"Tt":
+        if letter and letter in "Tt":
             return "stopped"
         return "healthy" if beat_age_s <= HUNG_AFTER_S else "hung"
+
+    def _letter(self) -> str:
+        """Return the state of the process as in ``/proc/PID/stat``, X if it is gone; empty if hidden."""
+        if self._fd < 0:  # there was no such process, or /proc hides other users' processes
+            try:
+                os.kill(self._identity.pid, 0)
+            except ProcessLookupError:
+                return "X"
+            except PermissionError:
+                pass
+            return ""
+        try:
+            found = _stat_fields(os.pread(self._fd, 1024, 0))
+        except ProcessLookupError:
+            return "X"
+        return found[0] if int(found[19]) == self._identity.start_time_ticks else "X"
 
     def close(self) -> None:
         """Close the descriptor."""
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
-
-
-def _read_stat(fd: int) -> bytes | None:
-    try:
-        return os.pread(fd, 1024, 0)
-    except ProcessLookupError:
-        return None
-
-
-def judge(identity: DaemonIdentity, beat_age_s: float) -> DaemonState:
-    """Return the daemon's state, from its process and the age of its last beat in seconds."""
-    if identity.pid_namespace and identity.pid_namespace != pid_namespace():
-        process: str = "unknown"  # the pid is not valid in this namespace: only the beat counts
-    else:
-        process = _process_state(identity.pid, identity.start_time_ticks)
-    if process == "dead":
-        return "dead"
-    if process == "stopped":
-        return "stopped"
-    return "healthy" if beat_age_s <= HUNG_AFTER_S else "hung"

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from shmmap.statistics.counters import PUBLISHED, SPANS, STEPS, WINDOWED, Histogram, lower_bound_ns
-from shmmap.statistics.snapshot import Snapshot
+from shmmap.statistics.reader import Snapshot
 
 if TYPE_CHECKING:
     from shmmap.protocol.rows import LiveMapRow

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read the statistics segment, also while the daemon is busy, stopped, hung or dead.
+"""Reads the statistics segment, also while the daemon is busy, stopped, hung or dead.
 
 Nothing is mapped or locked, so a reader can neither delay nor harm the daemon.
 """
@@ -9,11 +9,14 @@ from __future__ import annotations
 import os
 import stat
 import time
+from functools import cached_property
 from types import TracebackType
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 from shmmap.errors import NotPermitted, SegmentCorrupt
 from shmmap.segment.names import DEFAULT_SHM_DIR, statistics_name
-from shmmap.statistics.identity import DaemonIdentity, WriterProcess
+from shmmap.statistics.counters import Counter, Histogram
+from shmmap.statistics.identity import DaemonIdentity, DaemonState, WriterProcess
 from shmmap.statistics.layout import (
     IDENTITY,
     TABLE,
@@ -23,13 +26,144 @@ from shmmap.statistics.layout import (
     unpack_identity,
     unpack_state,
 )
-from shmmap.statistics.snapshot import Snapshot
 
-__all__ = ["StatisticsReader", "read_statistics"]
+if TYPE_CHECKING:
+    import msgspec
+
+    from shmmap.protocol.rows import CellRow, ClientRow, LiveMapRow
+
+__all__ = ["Snapshot", "StatisticsReader", "read_statistics"]
+
+_Row = TypeVar("_Row", bound="msgspec.Struct")
 
 _ATTEMPTS = 100
 _TABLE_ATTEMPTS = 16
 _HEADER_BYTES = 16384
+
+
+class Snapshot:
+    """The statistics at one moment.
+
+    Attributes
+    ----------
+    state : str
+        ``healthy``; ``starting`` (it beats, but does not listen yet); ``stopped`` (SIGSTOP, a debugger);
+        ``hung`` (runs, but has not beaten for 5 s); ``dead`` (the process is gone and left its segment);
+        ``absent`` (no segment: never started, or stopped cleanly).  All but ``absent`` come with an identity.
+    identity : DaemonIdentity or None
+        The daemon that wrote the statistics; None when absent.
+    beat_age_s : float
+        Seconds since the daemon last wrote; infinite when absent.
+    beat_monotonic_ns : int
+        Time of that write, CLOCK_MONOTONIC.
+    rows_missing : int
+        Number of cells for which the table had no room.
+    size_bytes : int
+        Memory of the segment.
+    """
+
+    def __init__(
+        self,
+        state: DaemonState | Literal["absent"],
+        identity: DaemonIdentity | None,
+        header: Header | None = None,
+        values: State | None = None,
+        *,
+        beat_age_s: float = float("inf"),
+        size_bytes: int = 0,
+        rows: bytes = b"",
+        clients: bytes = b"",
+        live: bytes = b"",
+    ) -> None:
+        self.identity = identity
+        self.beat_age_s = beat_age_s
+        self.beat_monotonic_ns = values.beat_monotonic_ns if values is not None else 0
+        self.rows_missing = values.rows_missing if values is not None else 0
+        self.size_bytes = size_bytes
+        self._header = header
+        self._values = values
+        self._rows = rows
+        self._clients = clients
+        self._live = live
+        self.state: DaemonState | Literal["absent"] = state
+        if state == "healthy" and self.counters.get("starting"):
+            self.state = "starting"
+
+    @cached_property
+    def counters(self) -> dict[str, int]:
+        """Values of the counters by name."""
+        if self._header is None or self._values is None:
+            return {}
+        names = (counter.name for counter in self._header.counters)
+        return dict(zip(names, self._values.values, strict=False))
+
+    @property
+    def descriptions(self) -> tuple[Counter, ...]:
+        """Descriptions of the counters, in the daemon's order."""
+        return self._header.counters if self._header is not None else ()
+
+    @property
+    def histogram_descriptions(self) -> tuple[Counter, ...]:
+        """Descriptions of the histograms, in the daemon's order."""
+        return self._header.histograms if self._header is not None else ()
+
+    @cached_property
+    def histograms(self) -> dict[str, Histogram]:
+        """Histograms by name."""
+        if self._header is None or self._values is None:
+            return {}
+        step = 1 + self._header.bucket_count
+        values = self._values.histograms
+        return {
+            description.name: Histogram.of(values[index * step : (index + 1) * step])
+            for index, description in enumerate(self._header.histograms)
+            if (index + 1) * step <= len(values)
+        }
+
+    @cached_property
+    def cells(self) -> list[CellRow]:
+        """The segments the daemon keeps, in id order, then layer and version.
+
+        A row that the daemon was changing at that moment (it was stopped during a write) is left out.
+        """
+        from shmmap.protocol.rows import CellRow
+
+        step = self._header.row_bytes if self._header is not None else 0
+        return sorted(_in_use(CellRow, self._rows, step), key=lambda row: (row.id, row.layer, row.version))
+
+    @cached_property
+    def clients(self) -> list[ClientRow]:
+        """The clients in the table, which may lack room for all, in order of arrival."""
+        from shmmap.protocol.rows import ClientRow
+
+        step = self._header.client_row_bytes if self._header is not None else 0
+        return _in_use(ClientRow, self._clients, step)
+
+    @cached_property
+    def live(self) -> list[LiveMapRow]:
+        """The live maps that the daemon keeps."""
+        if not self._live.strip(b"\0"):
+            return []  # saves the import: most daemons keep no live maps
+        from shmmap.protocol.rows import LiveMapRow
+
+        step = self._header.live_row_bytes if self._header is not None else 0
+        return _in_use(LiveMapRow, self._live, step)
+
+
+def _in_use(kind: type[_Row], data: bytes, step: int) -> list[_Row]:
+    """Return the rows of a table that are in use, except those that were being changed."""
+    from shmmap.statistics.rows import unpack_row
+
+    found = []
+    view = memoryview(data)
+    for at in range(0, len(view) - step + 1, step) if step else ():
+        try:
+            row = unpack_row(kind, view[at : at + step])
+        except SegmentCorrupt:
+            continue
+        if row is not None:
+            found.append(row)
+    return found
 
 
 class StatisticsReader:
@@ -112,6 +246,7 @@ class StatisticsReader:
         identity, process = self._who(header)
         state = _newest_state(self._fd, header)
         age_s = (time.monotonic_ns() - state.beat_monotonic_ns) * 1e-9
+        clients, live = (min(state.clients_used, header.max_clients), header.max_live) if tables else (0, 0)
         return Snapshot(
             process.state(age_s),
             identity,
@@ -120,8 +255,8 @@ class StatisticsReader:
             beat_age_s=max(age_s, 0.0),
             size_bytes=status.st_blocks * 512,
             rows=_rows(self._fd, header, state.rows_used) if tables and cells else b"",
-            clients=_clients(self._fd, header, state.clients_used) if tables else b"",
-            live=_live(self._fd, header) if tables else b"",
+            clients=_table(self._fd, header.clients_offset, clients * header.client_row_bytes),
+            live=_table(self._fd, header.live_offset, live * header.live_row_bytes),
         )
 
     def _who(self, header: Header) -> tuple[DaemonIdentity, WriterProcess]:
@@ -222,14 +357,8 @@ def _rows(fd: int, header: Header, used: int) -> bytes:
     return rows
 
 
-def _clients(fd: int, header: Header, used: int) -> bytes:
-    nbytes = min(used, header.max_clients) * header.client_row_bytes
-    return os.pread(fd, _within(fd, header.clients_offset, nbytes), header.clients_offset)
-
-
-def _live(fd: int, header: Header) -> bytes:
-    nbytes = _within(fd, header.live_offset, header.max_live * header.live_row_bytes)
-    return os.pread(fd, nbytes, header.live_offset)
+def _table(fd: int, offset: int, nbytes: int) -> bytes:
+    return os.pread(fd, _within(fd, offset, nbytes), offset)
 
 
 def _within(fd: int, offset: int, nbytes: int) -> int:

@@ -62,11 +62,6 @@ _RESTORE_AGAIN_S = 5.0
 _COPIED_BYTES = 4 << 20  # per millisecond, of a segment that is created again
 
 
-def _always(nbytes: int) -> bool:
-    del nbytes
-    return True
-
-
 _LONGEST: Final = {kind: f"longest_turn_{kind}_ns" for kind in TURN_KINDS}
 
 
@@ -166,7 +161,7 @@ class StatisticsWriter:
         mode: int = 0o400,
         gid: int = -1,
         starting: bool = False,
-        reserve: Callable[[int], bool] = _always,
+        reserve: Callable[[int], bool] = lambda _nbytes: True,
     ) -> None:
         self.values: dict[str, int] = dict.fromkeys(COUNTER_NAMES, 0)
         self.values["starting"] = int(starting)

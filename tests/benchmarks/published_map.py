@@ -30,10 +30,9 @@ from shmmap.origin.remote.published_object import (
     ObjectName,
     bare_object,
     pack_object,
-    unpack_object,
     write_segment,
 )
-from shmmap.origin.remote.zstd_frame import pack_frame
+from shmmap.origin.remote.zstd_frame import pack_frame, unpack_frame
 from tests.benchmarks.load_pcd import cloud, cut
 
 LIMIT, LIMIT_MM = 0.63, 0.36
@@ -74,8 +73,10 @@ def objects(paths: list[Path], repeats: int) -> bool:
             pack_object(unpacked, sha256(unpacked).digest())
 
         def decode(made: tuple[ObjectName, bytes], identity: CellIdentity = identity) -> None:
-            target = os.memfd_create("loaded")
-            write_segment(unpack_object(made[1], made[0]), target, identity, "points")
+            target, (name, frame) = os.memfd_create("loaded"), made
+            assert sha256(frame).digest() == name.sha256
+            unpacked = unpack_frame(frame, name.raw, name=name.path, exact=True)
+            write_segment(unpacked, target, identity, "points")
             os.close(target)
 
         def compress(pcd: bytes = pcd) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stores of published maps on this machine: moto's S3 server, a whole Ceph, a web server.
+"""Stores of published maps on this machine: moto's S3 server, a whole Ceph, a web server, memory.
 
 ``python -m tests.support.map_stores LOG`` prints the port of an S3 server.  A line of LOG is
 ``METHOD PATH STATUS BYTES``.
@@ -24,11 +24,13 @@ import urllib.request
 import uuid
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, Final
 
 import pytest
 
+from shmmap.errors import Offline
 from tests.support.command_line import Verbs
 from tests.support.daemon_process import Deadline, LineProcess, until
 from tests.support.divided_map import make_map
@@ -412,3 +414,31 @@ def signed_maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
     run("publish", made.root, folder / "equal", "--sign", folder / "keys")
     Signed(folder / "equal", folder / "keys").write_all(3)  # newer than the other version 2
     return folder
+
+
+class MemoryStore:
+    """Objects in memory, which can be held back, or out of reach."""
+
+    url = "memory:"
+
+    def __init__(self) -> None:
+        self.objects: dict[str, bytes] = {}
+        self.open = threading.Event()
+        self.open.set()
+        self.is_out = False
+        self.asked: list[str] = []
+
+    def get_exactly(self, path: str, nbytes: int) -> memoryview:
+        self.asked.append(path)
+        assert self.open.wait(60.0)
+        if self.is_out:
+            raise Offline("no answer")
+        data = self.objects[path]
+        assert len(data) == nbytes
+        return memoryview(data)
+
+    def add(self, data: bytes) -> bytes:
+        """Add an object; returns its SHA-256."""
+        digest = sha256(data).digest()
+        self.objects[f"blobs/sha256/{digest.hex()}"] = data
+        return digest

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from shmmap.protocol.rows import ClientRow, LiveMapRow
     from shmmap.statistics.counters import Histogram
     from shmmap.statistics.identity import DaemonIdentity
-    from shmmap.statistics.snapshot import Snapshot
+    from shmmap.statistics.reader import Snapshot
 
 __all__ = ["Line", "budget_parts", "screen"]
 

@@ -15,7 +15,7 @@ from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.records import Resident
 from shmmap.daemon.turns import Walk
 from shmmap.large_tables import ShardedDict
-from shmmap.origin.catalogue_change import CatalogueChange
+from shmmap.origin.catalogue import CatalogueChange
 from shmmap.segment.version import Stamp
 
 __all__ = ["MapSwitch"]

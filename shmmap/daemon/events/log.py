@@ -23,7 +23,7 @@ from shmmap.protocol import events
 from shmmap.protocol.events import EventPage, Recent, encode_event
 from shmmap.statistics.writer import StatisticsWriter
 
-__all__ = ["EventLog", "EventPublisher", "MinuteLog", "events_path"]
+__all__ = ["EventLog", "MinuteLog", "event_listener", "events_path"]
 
 REMEMBERED: Final = 4096
 """Events stored for later requests: less than a megabyte."""
@@ -119,36 +119,27 @@ def events_path(request_path: str) -> str:
     return request_path.removesuffix(".sock") + ".events.sock"
 
 
-class EventPublisher:
-    """The socket of the event log: clients subscribe to all events or to none.
+def event_listener(
+    listening: socket.socket,
+    watched: WatchedDescriptors,
+    connections: Connections,
+    statistics: StatisticsWriter,
+    event_log: EventLog,
+) -> Listener:
+    """Return a listener at the event log's socket: clients subscribe to all events or to none."""
 
-    Parameters
-    ----------
-    listening
-        A listening socket.
-    """
-
-    def __init__(
-        self,
-        listening: socket.socket,
-        watched: WatchedDescriptors,
-        connections: Connections,
-        statistics: StatisticsWriter,
-        event_log: EventLog,
-    ) -> None:
-        self._log = event_log
-        self.listener = Listener(
-            listening, watched, connections, statistics, b"XPUB", b"SUB", MAX_SUBSCRIPTION_BYTES,
-            self._on_message, event_log.unsubscribe,
-        )  # fmt: skip
-
-    def _on_message(self, connection: Connection, body: bytes, several: bool) -> None:
+    def on_message(connection: Connection, body: bytes, several: bool) -> None:
         if several or body not in (_SUBSCRIBE, b"\x00"):
             connection.cut("it subscribed to some of the events: only all can be subscribed to")
         elif body == _SUBSCRIBE:
-            self._log.subscribe(connection)
+            event_log.subscribe(connection)
         else:
-            self._log.unsubscribe(connection)
+            event_log.unsubscribe(connection)
+
+    return Listener(
+        listening, watched, connections, statistics, b"XPUB", b"SUB", MAX_SUBSCRIPTION_BYTES,
+        on_message, event_log.unsubscribe,
+    )  # fmt: skip
 
 
 class MinuteLog:

@@ -22,9 +22,9 @@ from shmmap.segment.directory import ShmDirectory
 __all__ = [
     "Mount",
     "choose_budget",
-    "file_system_of",
     "loader_bytes",
     "memory_limit_bytes",
+    "mount_of",
     "mounts",
     "out_of_memory_kills",
     "room_in_group",
@@ -216,8 +216,8 @@ def mounts(path: str = "/proc/self/mountinfo") -> Iterator[Mount]:
             yield Mount(kind, fields[3], point, options.split(","))
 
 
-def file_system_of(path: str) -> str:
-    """Return the type of the file system that a path is on; empty if unknown."""
+def mount_of(path: str) -> Mount | None:
+    """Return the mount that a path is on; None if unknown."""
     below = os.path.realpath(path) + "/"
     around = [mount for mount in mounts() if below.startswith(mount.point.rstrip("/") + "/")]
-    return max(reversed(around), key=lambda mount: len(mount.point)).kind if around else ""
+    return max(reversed(around), key=lambda mount: len(mount.point), default=None)

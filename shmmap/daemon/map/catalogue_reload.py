@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from shmmap.daemon.map.catalogue_view import CatalogueView, ViewOrigin
 from shmmap.errors import InternalError, ShmmapError
 from shmmap.logfmt import log
-from shmmap.origin.catalogue_change import CatalogueChange
+from shmmap.origin.catalogue import CatalogueChange
 
 __all__ = ["Reloader", "Reread"]
 

@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.geometry import Area
-from shmmap.origin.catalogue_change import CatalogueChange
+from shmmap.origin.catalogue import CatalogueChange
 from shmmap.origin.map_layout import OpenedDirectories
 from shmmap.origin.map_report import MapFrame
 from shmmap.segment.version import Source, Stamp

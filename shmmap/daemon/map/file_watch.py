@@ -29,7 +29,7 @@ from shmmap.daemon.host.inotify import (
     SELF_MOVED,
     Inotify,
 )
-from shmmap.daemon.host.memory import file_system_of
+from shmmap.daemon.host.memory import mount_of
 from shmmap.errors import CannotStart
 from shmmap.logfmt import log
 
@@ -130,11 +130,11 @@ class FileWatch:
             if refused is not None and refused.errno not in (errno.ENOENT, errno.ENOTDIR):
                 self.close()
                 raise _refusal(refused)
-            if (kind := file_system_of(directory)) in _REMOTE:
+            if (mount := mount_of(directory)) is not None and mount.kind in _REMOTE:
                 log.warning(
                     "changes made on other machines are not noticed",
                     directory=directory,
-                    file_system=kind,
+                    file_system=mount.kind,
                     hint="shmmap reload",
                 )
 

@@ -43,7 +43,7 @@ from shmmap.origin.remote.opened_store import ServedFrom, open_for_serving
 from shmmap.origin.remote.published_index import Root, Shard, unpack_root, unpack_shard
 from shmmap.origin.remote.store import PROBE, ObjectReader, Store
 from shmmap.origin.remote.taken_version import TakenVersion, TakenVersionFile, judge_offer
-from shmmap.origin.remote.verify_apart import VerifySettings, read_trusted_root, verify_apart
+from shmmap.origin.remote.verify_apart import Verified, VerifySettings, read_trusted_root, verify_apart
 from shmmap.statistics.counters import REFUSALS
 
 __all__ = ["PublishedOrigin"]
@@ -51,14 +51,6 @@ __all__ = ["PublishedOrigin"]
 NOTHING: Final = CurrentState(None, None)
 VERIFY_S: Final = 30.0
 """Time limit for verification, seconds; requests to a silent server time out long before."""
-
-
-class _Offer(NamedTuple):
-    """The version that the origin names as current; if signed, with the times of signature and expiry."""
-
-    current: Current
-    signed_s: float = 0.0
-    expires_s: float = 0.0
 
 
 class _Problem(NamedTuple):
@@ -155,8 +147,7 @@ class PublishedOrigin:
         self._pages: weakref.WeakSet[ShardPages] = weakref.WeakSet()
         self.keeper: ObjectKeeper | None = None
         if self._tier is not None:
-            cells = kept_objects(self._store, cache_dir, cache_bytes, quiet=True)
-            self.keeper = ObjectKeeper(cells, self._tier, self.link.doubt)
+            self.keeper = ObjectKeeper(KeptObjects(self._store, self._tier), self._tier, self.link.doubt)
 
     # --- taking a version -------------------------------------------------------------------------
 
@@ -223,7 +214,7 @@ class PublishedOrigin:
             self._fetch_all(root, known, self._index)
         return self._take(taken, root, known)
 
-    def _read_offer(self) -> _Offer:
+    def _read_offer(self) -> Verified:
         """Ask for the current version: the signed one, or without a root of trust the one in ``CURRENT``."""
         self._refused = 0
         if self._trust:
@@ -233,9 +224,10 @@ class PublishedOrigin:
             raise MapMissing(
                 f"no map is published at {self.path}", hint="shmmap publish MAP URL publishes one"
             )
-        return _Offer(self._seen.current)
+        number, root, nbytes = msgspec.structs.astuple(self._seen.current)
+        return Verified(number, root, nbytes, trust="", signed_s=0.0, expires_s=0.0)
 
-    def _verify(self) -> _Offer:
+    def _verify(self) -> Verified:
         """Verify in a separate process which version is signed."""
         tag = None
         with contextlib.suppress(MapMissing, MapDataError):  # verification reports what is wrong
@@ -256,9 +248,9 @@ class PublishedOrigin:
                 hint="restart it: what is signed under this one is verified then",
             )
         self._seen = CurrentState(verified.current, tag)
-        return _Offer(verified.current, verified.signed_s, verified.expires_s)
+        return verified
 
-    def _judge(self, offer: _Offer) -> None:
+    def _judge(self, offer: Verified) -> None:
         """Refuse an unacceptable version; the version taken may have been signed again."""
         with self._lock:
             taken = self._taken
@@ -380,16 +372,9 @@ class PublishedOrigin:
                 log.warning("the version taken cannot be remembered for the next start", reason=error)
 
     @property
-    def expires_s(self) -> float | None:
-        """When the signature of the version taken expires, Unix time; None if it is not signed."""
-        taken = self._taken
-        return taken.expires_s or None if taken is not None else None
-
-    @property
-    def signed_s(self) -> float:
-        """When the version taken was signed, Unix time; 0 if it is not signed."""
-        taken = self._taken
-        return taken.signed_s if taken is not None else 0.0
+    def taken(self) -> TakenVersion | None:
+        """The version taken last, with the times of its signature; it may still wait for its pages."""
+        return self._taken
 
     @property
     def refusal(self) -> str:

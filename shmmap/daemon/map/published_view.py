@@ -4,19 +4,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cached_property
-from typing import Final, TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.daemon.map.catalogue_view import Ready
-from shmmap.daemon.map.shard_pages import ShardFetcher, ShardPages
+from shmmap.daemon.map.shard_pages import Page, ShardFetcher, ShardPages
 from shmmap.errors import BadRequest
 from shmmap.geometry import Area
 from shmmap.layers.spec import layer_spec
-from shmmap.origin.catalogue_change import CatalogueChange
+from shmmap.origin.catalogue import CatalogueChange
 from shmmap.origin.map_report import MapFrame
 from shmmap.origin.remote.published_index import MILLIMETRES, Root, Shard, published_layer_version
 from shmmap.origin.remote.published_object import POINTS, LayerSource, pack_source
@@ -26,8 +25,6 @@ from shmmap.segment.version import Source, Stamp
 __all__ = ["PublishedView"]
 
 Indices: TypeAlias = NDArray[np.intp]
-_Found: TypeAlias = tuple[Indices, Indices, Indices, Indices]
-"""Cells that were added, removed, changed and moved."""
 _Pair: TypeAlias = tuple[int | None, int | None]
 """Numbers of the shards that cover one place in an earlier version and in a later one."""
 MM_BYTES: Final = 6
@@ -35,14 +32,13 @@ MM_BYTES: Final = 6
 _NOTHING: Final = np.empty(0, np.intp)
 
 
-@dataclass(frozen=True, slots=True)
-class _Difference:
-    """Rows of a shard that differ between two versions: added, removed, changed, moved."""
+class _Difference(NamedTuple):
+    """Indices of cells that differ between two versions; of removed cells in the earlier one."""
 
-    added: tuple[int, ...] = ()
-    removed: tuple[int, ...] = ()
-    changed: tuple[int, ...] = ()
-    moved: tuple[int, ...] = ()
+    added: list[int]
+    removed: list[int]
+    changed: list[int]
+    moved: list[int]
 
 
 class PublishedView:
@@ -72,8 +68,9 @@ class PublishedView:
         self.bounds: tuple[float, float, float, float] | None = root.bounds
         self.mean_size = root.mean_m
         self._differing: tuple[Root, list[_Pair]] | None = None
-        self._compared: dict[_Pair, _Difference] = {}
-        self._changed: _Found | None = None
+        self._compared: set[_Pair] = set()
+        self._found = _Difference([], [], [], [])
+        self._changed: tuple[Indices, Indices, Indices, Indices] | None = None
 
     @cached_property
     def _ready(self) -> dict[str, int]:
@@ -216,48 +213,37 @@ class PublishedView:
         same_ids = before.id_prefix == self.id_prefix
         if self._differing is None or self._differing[0] is not before.root:
             self._compared.clear()
-            self._changed = None
+            self._found, self._changed = _Difference([], [], [], []), None
             self._differing = before.root, _differing_shards(before.root, self.root, same_ids=same_ids)
         pairs = self._differing[1]
-        theirs = {was: _shard(before, was) for was, _ in pairs if was is not None}
-        ours = {now: _shard(self, now) for _, now in pairs if now is not None}
+        theirs = {was: before.pages.page(was) for was, _ in pairs if was is not None}
+        ours = {now: self.pages.page(now) for _, now in pairs if now is not None}
         if None in theirs.values():
             return unknown
-        if self._changed is None:
-            for was, now in pairs:
-                old = theirs[was] if was is not None else None
-                new = ours[now] if now is not None else None
-                if (was, now) not in self._compared and (now is None or new is not None):
-                    self._compared[was, now] = _compare(old, new, same_ids=same_ids)
+        for was, now in pairs if self._changed is None else ():
+            old = theirs[was] if was is not None else None
+            new = ours[now] if now is not None else None
+            if (was, now) not in self._compared and (now is None or new is not None):
+                self._compared.add((was, now))
+                _compare(old, new, self._found, same_ids=same_ids)
         if None in ours.values():
             return unknown
         if self._changed is None:
-            self._changed = self._put_together(before, same_ids=same_ids)
-            self._compared.clear()
+            if same_ids and self._found.added and self._found.removed:
+                self._note_moved(before)
+            added, removed, changed, moved = (np.sort(np.array(some, np.intp)) for some in self._found)
+            self._changed = added, removed, changed, moved
         return CatalogueChange(before, self, *self._changed)
 
-    def _put_together(self, before: PublishedView, *, same_ids: bool) -> _Found:
-        """Return the differences of all shards, ascending."""
-        found: dict[str, list[int]] = {"added": [], "removed": [], "changed": [], "moved": []}
-        for (was, now), difference in self._compared.items():
-            old_first = before.pages.cells(was).start if was is not None else 0
-            new_first = self.pages.cells(now).start if now is not None else 0
-            for how, rows in found.items():
-                first = old_first if how == "removed" else new_first
-                rows += [first + row for row in getattr(difference, how)]
-        if same_ids and found["added"] and found["removed"]:
-            self._note_moved(found, before)
-        added, removed, changed, moved = (np.sort(np.array(some, np.intp)) for some in found.values())
-        return added, removed, changed, moved
-
-    def _note_moved(self, found: dict[str, list[int]], before: PublishedView) -> None:
+    def _note_moved(self, before: PublishedView) -> None:
         """Note as moved the cells that left one shard and appear in another."""
-        left = {before.id(index): index for index in found["removed"]}
-        came = {self.id(index): index for index in found["added"]}
-        moved = left.keys() & came.keys()
-        found["removed"] = [index for cell, index in left.items() if cell not in moved]
-        found["added"] = [index for cell, index in came.items() if cell not in moved]
-        found["moved"] += [came[cell] for cell in moved]
+        added, removed, _, moved = self._found
+        left = {before.id(index): index for index in removed}
+        came = {self.id(index): index for index in added}
+        both = left.keys() & came.keys()
+        removed[:] = [index for cell, index in left.items() if cell not in both]
+        added[:] = [index for cell, index in came.items() if cell not in both]
+        moved += [came[cell] for cell in both]
 
 
 def _differing_shards(old: Root, new: Root, *, same_ids: bool) -> list[_Pair]:
@@ -279,28 +265,19 @@ def _differing_shards(old: Root, new: Root, *, same_ids: bool) -> list[_Pair]:
     ]
 
 
-def _shard(view: PublishedView, number: int) -> Shard | None:
-    """Return a shard of a version if it is in memory."""
-    page = view.pages.page(number)
-    return page.shard if page is not None else None
-
-
-def _compare(old: Shard | None, new: Shard | None, *, same_ids: bool) -> _Difference:
-    """Return the cells that differ between two states of a shard; None stands for no shard."""
-    before = {name: row for row, name in enumerate(old.names)} if old is not None else {}
-    after = {name: row for row, name in enumerate(new.names)} if new is not None else {}
+def _compare(old: Page | None, new: Page | None, found: _Difference, *, same_ids: bool) -> None:
+    """Add the cells that differ between two states of a shard to ``found``; None stands for no shard."""
+    before = {name: row for row, name in enumerate(old.shard.names)} if old is not None else {}
+    after = {name: row for row, name in enumerate(new.shard.names)} if new is not None else {}
     both = before.keys() & after.keys() if same_ids else set[bytes]()
-    changed, moved = [], []
+    if new is not None:
+        found.added.extend(new.first + row for name, row in after.items() if name not in both)
+    if old is not None:
+        found.removed.extend(old.first + row for name, row in before.items() if name not in both)
     if old is not None and new is not None:
         for name in both:
             was, row = before[name], after[name]
-            if old.box(was) != new.box(row):
-                moved.append(row)
-            if old.stamp(was) != new.stamp(row):
-                changed.append(row)
-    return _Difference(
-        tuple(row for name, row in after.items() if name not in both),
-        tuple(row for name, row in before.items() if name not in both),
-        tuple(changed),
-        tuple(moved),
-    )
+            if old.shard.box(was) != new.shard.box(row):
+                found.moved.append(new.first + row)
+            if old.shard.stamp(was) != new.shard.stamp(row):
+                found.changed.append(new.first + row)

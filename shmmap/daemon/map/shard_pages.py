@@ -107,14 +107,14 @@ class ShardFetcher:
         self._objects = objects
         self._failed = failed
         self._condition = threading.Condition()
-        self._wanted: list[tuple[float, int, weakref.ref[ShardPages], Root, int]] = []
+        self._wanted: list[tuple[float, int, weakref.ref[ShardPages], int]] = []
         self._under_way: set[tuple[int, int]] = set()
         self._threads: list[threading.Thread] = []
         self._idle = 0
         self._count = 0
         self._closed = False
 
-    def want(self, pages: ShardPages, root: Root, number: int, priority: float) -> None:
+    def want(self, pages: ShardPages, number: int, priority: float) -> None:
         """Request a shard unless it is being fetched; shards with the lowest priority come first.
 
         A shard that is requested again with a lower priority may be delivered twice.
@@ -123,7 +123,7 @@ class ShardFetcher:
             if (id(pages), number) in self._under_way:
                 return
             self._count += 1
-            heapq.heappush(self._wanted, (priority, self._count, weakref.ref(pages), root, number))
+            heapq.heappush(self._wanted, (priority, self._count, weakref.ref(pages), number))
             self._condition.notify()
             if self._idle < len(self._wanted) and len(self._threads) < THREADS:
                 thread = threading.Thread(target=self._run, name="shards", daemon=True)
@@ -135,7 +135,7 @@ class ShardFetcher:
 
     def _run(self) -> None:
         while (taken := self._take()) is not None:
-            reference, root, number = taken
+            reference, number = taken
             pages = reference()
             if pages is None:  # its version is no longer served
                 continue
@@ -144,7 +144,7 @@ class ShardFetcher:
                 if key in self._under_way:
                     continue
                 self._under_way.add(key)
-            shard = self._fetch(root, number)
+            shard = self._fetch(pages.root, number)
             with self._condition:
                 self._under_way.discard(key)
             pages.deliver(number, shard)
@@ -152,7 +152,7 @@ class ShardFetcher:
             if shard is None:
                 self._failed()
 
-    def _take(self) -> tuple[weakref.ref[ShardPages], Root, int] | None:
+    def _take(self) -> tuple[weakref.ref[ShardPages], int] | None:
         with self._condition:
             self._idle += 1
             while not self._wanted and not self._closed:
@@ -339,7 +339,7 @@ class ShardPages:
             absent.append(number)
             if number not in self._lost and priority < self._wanted.get(number, np.inf):
                 self._wanted[number] = priority
-                self._fetcher.want(self, self.root, number, priority)
+                self._fetcher.want(self, number, priority)
         if absent:
             x, y = self._boxes[absent, :2].mean(axis=0).tolist()
             self._around, self._nearest = (x, y), None
@@ -450,6 +450,6 @@ class ShardPages:
                 self._nearest = iter((number,))  # no memory is left, until an area needs other pages
                 return
             self._wanted[number] = BACKGROUND
-            self._fetcher.want(self, self.root, number, BACKGROUND)
+            self._fetcher.want(self, number, BACKGROUND)
             if len(self._wanted) >= BACKGROUND_FETCHES:
                 return

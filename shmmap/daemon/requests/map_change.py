@@ -16,7 +16,7 @@ from shmmap.daemon.map.catalogue_reload import Reloader, Reread
 from shmmap.daemon.requests.paging import Paging
 from shmmap.errors import ShmmapError
 from shmmap.logfmt import log
-from shmmap.origin.catalogue_change import CatalogueChange
+from shmmap.origin.catalogue import CatalogueChange
 from shmmap.protocol import events
 
 __all__ = ["MapChange"]

@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.holders import Survey
@@ -28,9 +28,8 @@ from shmmap.statistics.layout import MAX_CLIENTS
 from shmmap.statistics.writer import StatisticsWriter
 
 if TYPE_CHECKING:
+    from shmmap.daemon.map.published_origin import PublishedOrigin
     from shmmap.origin.remote.object_tier import ObjectCounts
-    from shmmap.origin.remote.taken_version import TakenVersion
-    from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = [
     "BEAT_S",
@@ -38,7 +37,6 @@ __all__ = [
     "RecentCounts",
     "Sampler",
     "SessionRows",
-    "VersionInService",
     "client_row",
 ]
 
@@ -283,34 +281,6 @@ class Sampler:
             self.on_beat()
 
 
-class VersionInService(Protocol):
-    """A published map's origin, as the source of its version and counts."""
-
-    @property
-    def in_service(self) -> TakenVersion | None:
-        """The version that is served; None while it is not known."""
-
-    @property
-    def refused_version(self) -> int:
-        """Number of the offered version that was refused; 0: none."""
-
-    @property
-    def expires_s(self) -> float | None:
-        """When the version's signature expires, Unix time; None if it is not signed."""
-
-    @property
-    def signed_s(self) -> float:
-        """When the version was signed, Unix time; 0 if it is not signed."""
-
-    @property
-    def refusal(self) -> str:
-        """Why the offer is refused, one of `REFUSALS`; empty if it is accepted."""
-
-    @property
-    def counts(self) -> ObjectCounts:
-        """Counts of index reads so far."""
-
-
 class PublishedGauges:
     """Statistics of a published map: its version, and the daemon's own reads.
 
@@ -321,17 +291,18 @@ class PublishedGauges:
         self._statistics = statistics
         self._counts: ObjectCounts | None = None
 
-    def look(self, origin: VersionInService) -> None:
+    def look(self, origin: PublishedOrigin) -> None:
         """Write the served version, and the reads since the last call."""
         statistics, counts = self._statistics, origin.counts
         if counts != self._counts:
             statistics.add_objects_read(counts if self._counts is None else counts.since(self._counts))
             self._counts = counts
-        taken, expires_s = origin.in_service, origin.expires_s
+        served, taken = origin.in_service, origin.taken
+        if served is not None:
+            statistics.set("published_version", served.version)
+            statistics.set("published_taken_unix_ns", int(served.taken_s * 1e9))
         if taken is not None:
-            statistics.set("published_version", taken.version)
-            statistics.set("published_taken_unix_ns", int(taken.taken_s * 1e9))
+            statistics.set("published_expires_unix_ns", int(taken.expires_s * 1e9))
+            statistics.set("published_signed_unix_ns", int(taken.signed_s * 1e9))
         statistics.set("published_refused", origin.refused_version)
         statistics.set("published_refusal", REFUSALS.index(origin.refusal))
-        statistics.set("published_expires_unix_ns", int((expires_s or 0.0) * 1e9))
-        statistics.set("published_signed_unix_ns", int(origin.signed_s * 1e9))

@@ -11,11 +11,12 @@ import os
 import re
 from collections.abc import Callable, Iterator
 from datetime import timedelta
-from typing import Any, Final, TypeVar, cast
+from typing import Any, Final, TypeVar
+from urllib.parse import urlsplit
 
 from shmmap.errors import BadRequest, ConfigError, MapDataError, MapMissing, Offline
 from shmmap.lazy_imports import FOR_REMOTE, needed_packages
-from shmmap.origin.remote.credentials import azure_settings, google_settings, s3_settings
+from shmmap.origin.remote.credentials import find_credentials
 from shmmap.origin.remote.store import (
     WEB_SCHEMES,
     Listed,
@@ -257,7 +258,6 @@ def server_url(where: StoreUrl) -> str:
 
 
 def _opened(where: StoreUrl, timeouts: Timeouts, *, insecure: bool, instance: bool) -> Any:
-    environment = os.environ
     endpoint = where.text if where.scheme in WEB_SCHEMES else _endpoint(where.scheme)
     plain = endpoint.lower().startswith("http://")
     if plain and not insecure and not is_loopback(_host(endpoint)):
@@ -284,20 +284,13 @@ def _opened(where: StoreUrl, timeouts: Timeouts, *, insecure: bool, instance: bo
     }
     given: dict[str, Any] = {"client_options": client, "retry_config": retry}
     try:
-        if where.scheme == "s3":
-            settings, provider = s3_settings(environment, instance=instance)
-            if provider is not None:
-                given["credential_provider"] = provider
-            return S3Store.from_url(where.text, config=cast("Any", settings), **given)
-        if where.scheme == "gs":
-            return GCSStore.from_url(
-                where.text, config=cast("Any", google_settings(environment, instance=instance)), **given
-            )
-        if where.scheme == "az":
-            return AzureStore.from_url(
-                where.text, config=cast("Any", azure_settings(environment, instance=instance)), **given
-            )
-        return HTTPStore.from_url(where.text, **given)
+        if where.scheme in WEB_SCHEMES:
+            return HTTPStore.from_url(where.text, **given)
+        found = find_credentials(where.scheme, os.environ, instance=instance)
+        if found.provider is not None:
+            given["credential_provider"] = found.provider
+        kind: Any = {"s3": S3Store, "gs": GCSStore, "az": AzureStore}[where.scheme]
+        return kind.from_url(where.text, config=found.settings, **given)
     except ConfigError:
         raise
     except (exceptions.BaseError, ValueError, TypeError, OSError):
@@ -313,8 +306,6 @@ def _endpoint(scheme: str) -> str:
 
 
 def _host(url: str) -> str:
-    from urllib.parse import urlsplit
-
     try:
         return urlsplit(url).hostname or ""
     except ValueError:

@@ -12,11 +12,12 @@ import contextlib
 import os
 from collections.abc import Callable, Mapping
 from datetime import datetime, timedelta, timezone
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from shmmap.errors import ConfigError
+from shmmap.origin.remote.store import BUCKET_SCHEMES
 
-__all__ = ["azure_settings", "credentials_source", "google_settings", "s3_settings"]
+__all__ = ["Credentials", "credentials_source", "find_credentials"]
 
 _DIRECTORY: Final = "CREDENTIALS_DIRECTORY"  # systemd.exec(5), LoadCredential=
 AWS_FILE: Final = "shmmap.aws"
@@ -51,8 +52,39 @@ _GCLOUD: Final = "~/.config/gcloud/application_default_credentials.json"
 _AGAIN_AFTER: Final = timedelta(minutes=5)
 _TRUE: Final = ("1", "true", "yes", "on")
 
-Settings = dict[str, Any]
-Provider = Callable[[], dict[str, Any]]
+_UNSIGNED: Final = "nowhere: requests are not signed"
+_INSTANCE: Final = "the cloud's metadata address (instance_credentials)"
+_NO_SIGNATURE: Final = {"skip_signature": True}
+
+
+class Credentials(NamedTuple):
+    """Credentials for one kind of store.
+
+    Attributes
+    ----------
+    settings
+        Settings for obstore; `_NO_SIGNATURE` is among them if there are no credentials.
+    source
+        Where the credentials are read from, for people; it never contains them.
+    provider
+        Returns the keys, if they are not among the settings.
+    """
+
+    settings: dict[str, Any]
+    source: str
+    provider: Callable[[], dict[str, Any]] | None = None
+
+
+def find_credentials(scheme: str, environment: Mapping[str, str], *, instance: bool = False) -> Credentials:
+    """Find the credentials for a bucket.
+
+    Raises
+    ------
+    ConfigError
+        A profile's credentials are of an unsupported kind, or incomplete, or a file of them is malformed.
+    """
+    find = {"s3": _s3_credentials, "gs": _google_credentials, "az": _azure_credentials}[scheme]
+    return find(environment, instance)
 
 
 def credentials_source(scheme: str, environment: Mapping[str, str], *, instance: bool = False) -> str:
@@ -63,29 +95,13 @@ def credentials_source(scheme: str, environment: Mapping[str, str], *, instance:
     Raises
     ------
     ConfigError
-        See `s3_settings` and `azure_settings`; also if the credentials have expired.
+        See `find_credentials`; also if the credentials have expired.
     """
-    if scheme == "s3":
-        return _s3_source(environment, instance=instance)
-    if scheme == "gs":
-        return _google_source(environment, instance=instance)
-    if scheme == "az":
-        return _azure_source(environment, instance=instance)
-    return ""
-
-
-_UNSIGNED: Final = "nowhere: requests are not signed"
-_INSTANCE: Final = "the cloud's metadata address (instance_credentials)"
-
-
-def _s3_source(environment: Mapping[str, str], *, instance: bool) -> str:
-    settings, provider = s3_settings(environment, instance=instance)
-    if provider is not None:
-        found = _static_keys(environment)
-        return found[1] if found is not None else _UNSIGNED
-    if "access_key_id" not in settings:
-        return _UNSIGNED if "skip_signature" in settings else _INSTANCE
-    if expiry := environment.get("AWS_CREDENTIAL_EXPIRATION"):
+    if scheme not in BUCKET_SCHEMES:
+        return ""
+    found = find_credentials(scheme, environment, instance=instance)
+    expiry = environment.get("AWS_CREDENTIAL_EXPIRATION")
+    if expiry and scheme == "s3" and "access_key_id" in found.settings:
         with contextlib.suppress(ValueError, TypeError):
             if datetime.fromisoformat(expiry.replace("Z", "+00:00")) <= datetime.now(timezone.utc):
                 raise ConfigError(
@@ -94,31 +110,23 @@ def _s3_source(environment: Mapping[str, str], *, instance: bool) -> str:
                     origin="environment",
                     hint="export others, and start the daemon again",
                 )
-    token = " with AWS_SESSION_TOKEN" if "session_token" in settings else ""
-    return f"the environment, AWS_ACCESS_KEY_ID{token}"
+    return found.source
 
 
-def s3_settings(
-    environment: Mapping[str, str], *, instance: bool = False
-) -> tuple[Settings, Provider | None]:
-    """Return an S3 store's settings, and a provider of its keys if the environment does not hold them.
-
-    Raises
-    ------
-    ConfigError
-        The profile's credentials are of an unsupported kind, or incomplete.
-    """
-    settings: Settings = {}
+def _s3_credentials(environment: Mapping[str, str], instance: bool) -> Credentials:
+    settings: dict[str, Any] = {}
     if not (environment.get("AWS_REGION") or environment.get("AWS_DEFAULT_REGION")):
         settings["region"] = _region(environment) or "us-east-1"
     if environment.get("AWS_SKIP_SIGNATURE", "").lower() in _TRUE:
-        return {**settings, "skip_signature": True}, None
+        return Credentials({**settings, **_NO_SIGNATURE}, _UNSIGNED)
     key, secret = environment.get("AWS_ACCESS_KEY_ID"), environment.get("AWS_SECRET_ACCESS_KEY")
     if key and secret:
-        given = {"access_key_id": key, "secret_access_key": secret}
+        settings |= {"access_key_id": key, "secret_access_key": secret}
+        source = "the environment, AWS_ACCESS_KEY_ID"
         if token := environment.get("AWS_SESSION_TOKEN"):
-            given["session_token"] = token
-        return {**settings, **given}, None
+            settings["session_token"] = token
+            source += " with AWS_SESSION_TOKEN"
+        return Credentials(settings, source)
     if key or secret:
         raise ConfigError("AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY are set only together")
     if not instance:
@@ -130,15 +138,17 @@ def s3_settings(
                     origin="environment",
                     hint=f"allow it: --instance-credentials; or {_EXPORT}",
                 )
-    if _static_keys(environment) is not None:
+    if (static := _static_keys(environment)) is not None:
 
         def provide() -> dict[str, Any]:
             found = _static_keys(environment)
             keys = found[0] if found is not None else {}
             return {**keys, "expires_at": datetime.now(timezone.utc) + _AGAIN_AFTER}
 
-        return settings, provide
-    return (settings if instance else {**settings, "skip_signature": True}), None
+        return Credentials(settings, static[1], provide)
+    if instance:
+        return Credentials(settings, _INSTANCE)
+    return Credentials({**settings, **_NO_SIGNATURE}, _UNSIGNED)
 
 
 def _static_keys(environment: Mapping[str, str]) -> tuple[dict[str, Any], str] | None:
@@ -196,41 +206,25 @@ def _config_section(profile: str) -> str:
     return f"profile {profile}" if profile and profile != "default" else "default"
 
 
-def google_settings(environment: Mapping[str, str], *, instance: bool = False) -> Settings:
-    """Return the settings of a store in Google Cloud."""
-    if any(environment.get(name) for name in _GOOGLE):
-        return {}
+def _google_credentials(environment: Mapping[str, str], instance: bool) -> Credentials:
+    if name := next((name for name in _GOOGLE if environment.get(name)), ""):
+        return Credentials({}, f"the environment, {name}")
     for path in _given_file(environment, GOOGLE_FILE):
         if os.path.exists(path):
-            return {"application_credentials": path}
-    if instance or os.path.exists(os.path.expanduser(_GCLOUD)):
-        return {}
-    return {"skip_signature": True}
-
-
-def _google_source(environment: Mapping[str, str], *, instance: bool) -> str:
-    settings = google_settings(environment, instance=instance)
-    if path := settings.get("application_credentials"):
-        return _named(environment, path)
-    if name := next((name for name in _GOOGLE if environment.get(name)), ""):
-        return f"the environment, {name}"
+            return Credentials({"application_credentials": path}, _named(environment, path))
     if os.path.exists(os.path.expanduser(_GCLOUD)):
-        return _GCLOUD
-    return _UNSIGNED if "skip_signature" in settings else _INSTANCE
+        return Credentials({}, _GCLOUD)
+    return Credentials({}, _INSTANCE) if instance else Credentials({**_NO_SIGNATURE}, _UNSIGNED)
 
 
-def azure_settings(environment: Mapping[str, str], *, instance: bool = False) -> Settings:
-    """Return the settings of a store in Azure.
+_AZURE_SECRETS: Final = {"account_key", "sas_key", "client_secret"}
 
-    Raises
-    ------
-    ConfigError
-        The service manager's file is not a list of ``NAME=VALUE``.
-    """
-    account = {}
-    found = dict(environment)
-    for path in _given_file(environment, AZURE_FILE):
-        found |= _lines(path)
+
+def _azure_credentials(environment: Mapping[str, str], instance: bool) -> Credentials:
+    settings: dict[str, Any] = {}
+    files = _given_file(environment, AZURE_FILE)
+    in_file = {name: value for path in files for name, value in _lines(path).items()}
+    found = {**environment, **in_file}
     for name in (
         "ACCOUNT_NAME",
         "ACCOUNT_KEY",
@@ -243,29 +237,17 @@ def azure_settings(environment: Mapping[str, str], *, instance: bool = False) ->
     ):
         value = found.get(f"AZURE_STORAGE_{name}") or found.get(f"AZURE_{name}")
         if value:
-            account["sas_key" if name == "SAS_TOKEN" else name.lower()] = value
-    if (
-        account.keys() & _AZURE_SECRETS
-        or instance
-        or environment.get("AZURE_USE_AZURE_CLI", "").lower() in _TRUE
-    ):
-        return account
-    return {**account, "skip_signature": True}
-
-
-_AZURE_SECRETS: Final = {"account_key", "sas_key", "client_secret"}
-
-
-def _azure_source(environment: Mapping[str, str], *, instance: bool) -> str:
-    settings = azure_settings(environment, instance=instance)
+            settings["sas_key" if name == "SAS_TOKEN" else name.lower()] = value
     if secrets := sorted(settings.keys() & _AZURE_SECRETS):
-        for path in _given_file(environment, AZURE_FILE):
-            if any(secrets[0].upper() in name for name in _lines(path)):
-                return _named(environment, path)
-        return f"the environment, AZURE_STORAGE_{secrets[0].upper()}"
-    if "skip_signature" in settings:
-        return _UNSIGNED
-    return _INSTANCE if instance else "the program az (AZURE_USE_AZURE_CLI)"
+        secret = secrets[0].upper()
+        is_in_file = any(secret in name for name in in_file)
+        source = _named(environment, files[0]) if is_in_file else f"the environment, AZURE_STORAGE_{secret}"
+        return Credentials(settings, source)
+    if instance:
+        return Credentials(settings, _INSTANCE)
+    if environment.get("AZURE_USE_AZURE_CLI", "").lower() in _TRUE:
+        return Credentials(settings, "the program az (AZURE_USE_AZURE_CLI)")
+    return Credentials({**settings, **_NO_SIGNATURE}, _UNSIGNED)
 
 
 def _named(environment: Mapping[str, str], path: str) -> str:

@@ -108,11 +108,11 @@ class ObjectTier:
             self._say(error)
         return None
 
-    def has(self, digest: bytes, nbytes: int, *, is_index: bool = False) -> bool:
-        """Whether an object's file exists with the right size; its content is verified when it is read."""
+    def has(self, digest: bytes, nbytes: int) -> bool:
+        """Whether a cell's object has a file of the right size; its content is verified when it is read."""
         try:
             with self._opened() as place:
-                status = os.stat(_path(digest, is_index), dir_fd=place, follow_symlinks=False)
+                status = os.stat(_path(digest, False), dir_fd=place, follow_symlinks=False)
         except OSError as error:
             self._say(error)
             return False

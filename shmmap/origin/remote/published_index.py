@@ -13,7 +13,7 @@ import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from hashlib import sha256
-from typing import Any, Final, Protocol, TypeAlias, TypeVar
+from typing import Any, Final, TypeAlias, TypeVar
 
 import msgspec
 import numpy as np
@@ -42,6 +42,7 @@ __all__ = [
     "LayerObjects",
     "Root",
     "Shard",
+    "ShardTable",
     "check_layers",
     "check_shards",
     "decode_map",
@@ -137,11 +138,27 @@ _SHARD: Final = msgspec.msgpack.Decoder(ShardFields)
 # --- columns ------------------------------------------------------------------------------------------
 
 
-class _HasLayers(Protocol):
-    """A root, or a part of one."""
+@dataclass(frozen=True, slots=True, eq=False)
+class ShardTable:
+    """Layers and shards of a root, or of a part of one.
 
-    @property
-    def layers(self) -> Mapping[str, int]: ...
+    Attributes
+    ----------
+    layers
+        Builder version of each layer by spec.
+    keys
+        (S, 2) int32, row and column of each shard, ascending.
+    counts, sizes
+        (S,) uint32, number of cells of each shard, and bytes of its object.
+    hashes
+        (S, 32) uint8, SHA-256 of each shard's object, its name.
+    """
+
+    layers: Mapping[str, int]
+    keys: NDArray[np.int32]
+    counts: NDArray[np.uint32]
+    sizes: NDArray[np.uint32]
+    hashes: NDArray[np.uint8]
 
 
 _Columns: TypeAlias = Mapping[str, tuple[str, str, int]]
@@ -181,7 +198,7 @@ def decode_map(unpacked: bytes, decoder: msgspec.msgpack.Decoder[_Struct], wrong
         raise wrong(f"no MessagePack map of its kind: {error}") from None
 
 
-def pack_fields(described: _HasLayers, kind: type[msgspec.Struct]) -> dict[str, Any]:
+def pack_fields(described: ShardTable, kind: type[msgspec.Struct]) -> dict[str, Any]:
     """Return the fields of a document of type ``kind`` for a root, or a part of one."""
     fields = {name: getattr(described, name) for name in kind.__struct_fields__ if hasattr(described, name)}
     layers = dict(sorted(described.layers.items()))
@@ -229,8 +246,8 @@ def _unpack_column(data: bytes, dtype: str, count: int, width: int, wrong: Damag
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Root:
-    """Root of one version of a published map.
+class Root(ShardTable):
+    """Root of one version of a published map; its layers ascend, and `POINTS` is one of them.
 
     Attributes
     ----------
@@ -246,14 +263,6 @@ class Root:
         Side of a shard, metres.
     largest_m, mean_m
         Largest and mean extent of the cells along x and y, metres.
-    layers
-        Builder version of each published layer by spec, ascending; `POINTS` is one of them.
-    keys
-        (S, 2) int32, row and column of each shard, ascending.
-    counts, sizes
-        (S,) uint32, number of cells of each shard, and bytes of its object.
-    hashes
-        (S, 32) uint8, SHA-256 of each shard's object, its name.
     map_version
         Map version of this root's content.
     """
@@ -269,11 +278,6 @@ class Root:
     shard_m: float
     largest_m: tuple[float, float]
     mean_m: tuple[float, float]
-    layers: Mapping[str, int]
-    keys: NDArray[np.int32]
-    counts: NDArray[np.uint32]
-    sizes: NDArray[np.uint32]
-    hashes: NDArray[np.uint8]
     map_version: int = 0
 
     @property

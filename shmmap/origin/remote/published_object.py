@@ -23,7 +23,7 @@ import xxhash
 from numpy.typing import NDArray
 
 from shmmap.errors import MapDataError, SegmentCorrupt
-from shmmap.origin.remote.zstd_frame import DAMAGED, pack_frame, unpack_frame
+from shmmap.origin.remote.zstd_frame import DAMAGED, pack_frame
 from shmmap.segment.header import pack_header, unpack_header
 from shmmap.segment.layout import (
     ALIGNMENT_BYTES,
@@ -54,7 +54,6 @@ __all__ = [
     "rows_of",
     "stamp_of",
     "to_millimetres",
-    "unpack_object",
     "unpack_source",
     "write_segment",
 ]
@@ -253,27 +252,6 @@ def _placed(columns: Sequence[Column], header_bytes: int) -> tuple[tuple[Column,
 
 
 # --- into a segment -----------------------------------------------------------------------------------
-
-
-def unpack_object(frame: bytes | memoryview, name: ObjectName, *, verified: bool = False) -> bytes:
-    """Verify an object against its name and return the unpacked content.
-
-    Parameters
-    ----------
-    verified
-        The hash was already verified.
-
-    Raises
-    ------
-    MapDataError
-        The hash or a size does not match (cause ``damaged``).  Nothing is unpacked before the hash matches.
-    """
-    path = name.path
-    if len(frame) != name.size:
-        raise MapDataError(f"it has {len(frame):,} bytes, not {name.size:,}", path=path, cause=DAMAGED)
-    if not verified and sha256(frame).digest() != name.sha256:
-        raise MapDataError("its SHA-256 is not its name", path=path, cause=DAMAGED)
-    return unpack_frame(frame, name.raw, name=path, exact=True)
 
 
 def write_segment(

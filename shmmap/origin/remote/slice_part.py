@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from typing import Final, NamedTuple
@@ -24,6 +24,7 @@ from shmmap.errors import BadRequest, MapDataError
 from shmmap.origin.remote.published_index import (
     Damage,
     Root,
+    ShardTable,
     check_layers,
     check_shards,
     decode_map,
@@ -121,11 +122,16 @@ def slice_of_shards(root: Root, slices: int) -> NDArray[np.int64]:
     return found
 
 
-class PartFields(msgspec.Struct, frozen=True):
-    """The MessagePack map of a part, in this order of keys."""
+class _Head(msgspec.Struct, frozen=True):
+    """The fields that show whether the rest of a part can be read."""
 
     format: str
     min_reader: int
+
+
+class PartFields(_Head, frozen=True):
+    """The MessagePack map of a part: those of `_Head`, and then these, in this order of keys."""
+
     version: int
     root_content: bytes
     slice: int
@@ -137,21 +143,14 @@ class PartFields(msgspec.Struct, frozen=True):
     shard_sha256: bytes
 
 
-class _Head(msgspec.Struct, frozen=True):
-    """The fields that show whether the rest of a part can be read."""
-
-    format: str
-    min_reader: int
-
-
 # created at import: msgspec crashes the process if two threads decode a type for the first time at once
 _HEAD: Final = msgspec.msgpack.Decoder(_Head)
 _PART: Final = msgspec.msgpack.Decoder(PartFields)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Part:
-    """The result of a slice.
+class Part(ShardTable):
+    """The result of a slice: the layers of its run, and its shards, whose objects include these layers.
 
     Attributes
     ----------
@@ -161,25 +160,12 @@ class Part:
         Content digest of that version's root, 32 bytes.
     slice, slices
         Number of the slice, from 1, and number of slices.
-    layers
-        Builder version of each layer of the run, by spec.
-    keys
-        (S, 2) int32, row and column of each shard of the slice, ascending.
-    counts, sizes
-        (S,) uint32, number of cells of each shard, and bytes of its object, which includes the run's layers.
-    hashes
-        (S, 32) uint8, SHA-256 of each shard's object, its name.
     """
 
     version: int
     root_content: bytes
     slice: int
     slices: int
-    layers: Mapping[str, int]
-    keys: NDArray[np.int32]
-    counts: NDArray[np.uint32]
-    sizes: NDArray[np.uint32]
-    hashes: NDArray[np.uint8]
 
     @property
     def run(self) -> RunName:

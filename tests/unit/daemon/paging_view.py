@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from shmmap.daemon.map.catalogue_view import CatalogueView, PageNews, Pages, Ready
 from shmmap.errors import Offline
 from shmmap.geometry import Area
-from shmmap.origin.catalogue import Catalogue
-from shmmap.origin.catalogue_change import CatalogueChange
+from shmmap.origin.catalogue import Catalogue, CatalogueChange
 from shmmap.segment.version import Source, Stamp
 
 __all__ = ["MemoryPages", "PagedOrigin", "PagedView"]

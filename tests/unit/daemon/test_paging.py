@@ -9,7 +9,6 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -39,7 +38,6 @@ WEST, EAST = 0, 1
 PAGES = np.array([[-40.0, -40.0, 0.0, 40.0], [0.0, -40.0, 40.0, 40.0]])
 EVERYWHERE = m.BoxMessage(-35.0, -35.0, 35.0, 35.0)
 IN_THE_WEST = m.BoxMessage(-35.0, -35.0, -5.0, 35.0)
-IN_THE_EAST = m.BoxMessage(5.0, -35.0, 35.0, 35.0)
 LONG_S = 200.0
 HALO = "denoise"
 
@@ -245,26 +243,10 @@ def test_an_id_that_is_not_known_may_be_somewhere(paged: Paged) -> None:
     assert (reply.covered, [one.id for one in reply.failed]) == (True, ["nowhere.pcd"])
 
 
-def _all_ids(one: Paged) -> list[str]:
-    whole = one.origin.whole
-    return [whole.id(index) for index in range(len(whole))]
-
-
-def _version(one: Paged, name: str) -> int:
-    index = one.origin.whole.find(name)
-    assert index is not None
-    return one.origin.whole.version(index)
-
-
 def _touches(area: m.CircleMessage, box: tuple[float, float, float, float]) -> bool:
     dx = max(box[0] - area.x, area.x - box[2], 0.0)
     dy = max(box[1] - area.y, area.y - box[3], 0.0)
     return dx * dx + dy * dy <= area.radius * area.radius
-
-
-def _absent(one: Paged, area: m.CircleMessage) -> list[int]:
-    around = m.area_from_message(area)
-    return [page for page in one.pages.of_area(around) if not one.pages.is_here(page)]
 
 
 STRIPS = np.array([[x, y, x + 40.0, y + 20.0] for x in (-40.0, 0.0) for y in (-40.0, -20.0, 0.0, 20.0)])
@@ -285,54 +267,6 @@ def removed(reply: m.Cells, held: dict[str, int]) -> set[str]:
     """Return what of it is to be dropped."""
     of_version = {version: name for name, version in held.items()}
     return {*reply.removed, *(of_version[version] for version in unpack_versions(reply.removed_packed))}
-
-
-@pytest.mark.parametrize("seed", [1, 2])
-def test_along_a_drive_every_reply_is_the_set_difference_of_what_is_known(
-    in_pages: Callable[..., Paged], seed: int
-) -> None:
-    """While pages come, fail and are given up, and the map changes."""
-    chance = random.Random(seed)
-    one = in_pages(STRIPS, set())
-    held: dict[str, int] = {}
-    covered = 0
-    for step in range(100):
-        action = chance.random()
-        if action < 0.4:
-            one.pages.come(chance.randrange(8))
-        elif action < 0.45:
-            one.pages.fail(*(page for page in [chance.randrange(8)] if not one.pages.is_here(page)))
-        elif action < 0.5:
-            held = {name: version for name, version in held.items() if chance.random() < 0.5}
-            one.ask(m.Evict)
-            one.give_up(chance.randrange(4))
-        elif action < 0.54:
-            one.directory.change(chance.choice(ALL), step)
-            one.read_again()
-        one.daemon.turn_until(lambda: one.pages.settled)
-        area = m.CircleMessage(chance.uniform(-40, 40), chance.uniform(-40, 40), chance.uniform(5, 30))
-        while True:
-            known = [one.view.id(i) for page in one.pages.needed for i in one.pages.cells(page)]
-            reply = one.ask(partial(difference, area=area, held=held, chance=chance))
-            gone = removed(reply, held)
-            box_of = {Path(cell).name: one.origin.whole.box(i) for i, cell in enumerate(_all_ids(one))}
-            inside = {name for name in ALL if _touches(area, box_of[name])}
-            now_known = {Path(cell).name for cell in known}
-            assert reply.covered is (not _absent(one, area))
-            assert gone == {
-                name for name in held if name not in inside and (name in now_known or reply.covered)
-            }
-            fresh = {cell.id: cell.version for cell in reply.cells if not cell.stale}
-            want = {name for name in inside & now_known if held.get(name) != _version(one, name)}
-            assert set(fresh) | {cell.id for cell in reply.pending} == want
-            assert all(version == _version(one, name) for name, version in fresh.items())
-            held = {name: version for name, version in held.items() if name not in gone} | fresh
-            if not reply.pending:
-                break
-        covered += reply.covered
-        if reply.covered:
-            assert held == {name: _version(one, name) for name in inside}
-    assert 10 < covered < 95, "else nothing was tried"
 
 
 @pytest.mark.parametrize("layer", ["points", HALO])

@@ -13,7 +13,7 @@ import shmmap
 from shmmap.daemon.config import DaemonConfig
 from shmmap.doctor.diagnosis import Diagnosis, Machine
 from shmmap.statistics.identity import DaemonIdentity
-from shmmap.statistics.snapshot import Snapshot
+from shmmap.statistics.reader import Snapshot
 
 USER = 61005
 IDENTITY = DaemonIdentity(

@@ -22,7 +22,7 @@ from shmmap.doctor.diagnosis import Diagnosis, Machine
 from shmmap.doctor.verdicts import Finding, cache_verdict, worst
 from shmmap.protocol.rows import ClientRow, LiveMapRow
 from shmmap.statistics.counters import COUNTER_NAMES, REFUSALS
-from shmmap.statistics.snapshot import Snapshot
+from shmmap.statistics.reader import Snapshot
 from tests.support.divided_map import make_map
 from tests.unit.doctor.conftest import USER, Ward, snapshot
 

@@ -15,8 +15,7 @@ import pytest
 
 from shmmap.errors import LimitReached, MapDataError, MapMissing
 from shmmap.geometry import Circle
-from shmmap.origin.catalogue_change import compare
-from shmmap.origin.map_directory import MapDirectory, open_map
+from shmmap.origin.map_directory import open_map
 from shmmap.segment.layout import SourceStamp
 from tests.support.divided_map import write_pcd
 
@@ -74,14 +73,6 @@ def test_metadata_beside_or_inside_a_directory_of_any_name(tmp_path: Path) -> No
     (cells / "pointcloud_data_metadata.yaml").rename(root / "pointcloud_map_metadata.yaml")
     check(cells, cells)
     check(root, cells)
-
-
-def test_metadata_elsewhere(tmp_path: Path) -> None:
-    cells, elsewhere = tmp_path / "cells", tmp_path / "elsewhere"
-    put_cells(cells)
-    elsewhere.mkdir()
-    (elsewhere / "m.yaml").write_text(metadata_text())
-    check(cells, cells, metadata=elsewhere / "m.yaml")
 
 
 def test_nested_folders_of_the_divider_s_large_grid(tmp_path: Path) -> None:
@@ -167,14 +158,6 @@ def test_entries_without_a_file_and_files_without_an_entry(tmp_path: Path) -> No
     ) as caught:
         open_map(root, strict=True).load()
     assert caught.value.cause == "missing_files"
-
-
-def test_many_missing_files_are_counted(tmp_path: Path) -> None:
-    put_cells(tmp_path, ["t_0_0.pcd"])
-    extra = "".join(f"gone_{i}.pcd: [{i}, 0]\n" for i in range(500))
-    (tmp_path / "pointcloud_map_metadata.yaml").write_text(metadata_text(["t_0_0.pcd"], extra))
-    (problem,) = open_map(tmp_path).load().problems
-    assert problem.endswith("gone_0.pcd, gone_1.pcd, gone_2.pcd, ... (500 in all)")
 
 
 @pytest.mark.parametrize(
@@ -305,22 +288,6 @@ def test_one_pcd_without_points_or_sense(tmp_path: Path) -> None:
     assert caught.value.cause == "lfs_pointer"
 
 
-def test_reload_sees_what_changed(tmp_path: Path) -> None:
-    root = autoware_map(tmp_path)
-    origin = open_map(root)
-    before = origin.load()
-    cells = root / "pointcloud_map.pcd"
-    (cells / "t_0_0.pcd").write_bytes(b"another content")
-    (cells / "t_20_0.pcd").unlink()
-    put_cells(cells, ["new.pcd"])
-    (root / "pointcloud_map_metadata.yaml").write_text(metadata_text(NAMES[::2], "new.pcd: [60, 60]\n"))
-    change = compare(before, origin.load(fresh=True))
-    assert change.ids("added") == (str(cells / "new.pcd"),)
-    assert change.ids("removed") == (str(cells / "t_20_0.pcd"),)
-    assert change.ids("changed") == (str(cells / "t_0_0.pcd"),)
-    assert before.map_version != origin.load().map_version
-
-
 @contextlib.contextmanager
 def only(count: int) -> Iterator[None]:
     """Limit how many more files this process can open."""
@@ -364,8 +331,3 @@ def test_without_descriptors_a_map_is_whole_or_the_limit_is_named(tmp_path: Path
     assert versions == [whole] * (12 - len(refused))
     assert len(refused) > 2
     assert all("LimitNOFILE=" in hint for hint in refused)
-
-
-def test_a_map_directory_knows_its_name(tmp_path: Path) -> None:
-    assert open_map(autoware_map(tmp_path)).path == str(tmp_path)
-    assert MapDirectory(path=str(tmp_path)).load().id_prefix == f"{tmp_path}/pointcloud_map.pcd/"

@@ -72,11 +72,6 @@ def test_a_report_of_any_kind_leaves_a_map(tmp_path: Path, text: str | None, fra
     assert read_map_frame(tmp_path) == frame
 
 
-def test_another_tool_s_map_has_none(moved_map: Path, tmp_path: Path) -> None:
-    (moved_map / REPORT_NAME).unlink()
-    assert open_map(moved_map, cache_dir=tmp_path / "cache").load().frame == UNKNOWN_FRAME
-
-
 def notes(corners: list[tuple[float, float]], size: float = 20.0, points: int = 100) -> list[str]:
     names = [f"{x:g}_{y:g}.pcd" for x, y in corners]
     return far_cells_notes(np.array(corners, np.float64).reshape(-1, 2), size, names, [points] * len(names))

@@ -19,9 +19,8 @@ from xxhash import xxh3_64_intdigest
 from shmmap.errors import MapDataError, MapMissing, ShmmapError
 from shmmap.geometry import Circle
 from shmmap.origin import cell_names, map_directory, spatial_index
-from shmmap.origin.catalogue import Catalogue
+from shmmap.origin.catalogue import Catalogue, compare
 from shmmap.origin.catalogue_bytes import Source, read_catalogue, write_catalogue
-from shmmap.origin.catalogue_change import compare
 from shmmap.origin.map_directory import MapDirectory
 from shmmap.origin.reading_apart import read_apart
 from shmmap.segment.layout import SourceStamp

@@ -15,9 +15,8 @@ import numpy as np
 import pytest
 
 from shmmap.origin import map_directory
-from shmmap.origin.catalogue import Catalogue
+from shmmap.origin.catalogue import Catalogue, compare
 from shmmap.origin.catalogue_bytes import default_cache_directory
-from shmmap.origin.catalogue_change import compare
 from shmmap.origin.map_directory import MapDirectory, open_map
 
 CELLS = 40

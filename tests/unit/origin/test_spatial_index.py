@@ -173,17 +173,3 @@ def test_corners_further_apart_than_any_number(monkeypatch: pytest.MonkeyPatch) 
     assert index.query(Circle(0.0, 0.0, 5.0)).tolist() == [0]
     assert index.query(Circle(1.15e308, 0.0, 5.0)).tolist() == [6]
     assert index.query(Box(-1.7e308, 0.0, 1.7e308, 0.5)).tolist() == list(range(8))
-
-
-def test_empty() -> None:
-    assert SpatialIndex(np.empty((0, 4))).query(Circle(0.0, 0.0, 1e9)).tolist() == []
-
-
-def test_small_and_large_catalogues_agree(monkeypatch: pytest.MonkeyPatch) -> None:
-    boxes = lattice(-300.0, 30, 20.0)
-    indexed = SpatialIndex(boxes)
-    monkeypatch.setattr("shmmap.origin.spatial_index._LINEAR_CELLS", 1 << 30)
-    linear = SpatialIndex(boxes)
-    assert indexed.nbytes > linear.nbytes == boxes.nbytes
-    area = Circle(3.0, 4.0, 77.0)
-    assert indexed.query(area).tolist() == linear.query(area).tolist() == brute_force(area, boxes)

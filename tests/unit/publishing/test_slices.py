@@ -7,7 +7,6 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from shmmap.errors import LoadFailed, MapMissing
@@ -139,4 +138,3 @@ def test_points_that_are_damaged_or_gone_are_no_points(store: Store, tmp_path: P
 )
 def test_numbers_are_said_compactly(numbers: list[int], text: str) -> None:
     assert numbers_text(numbers) == text
-    assert numbers_text(np.array(numbers, int).tolist()) == text

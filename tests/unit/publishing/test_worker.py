@@ -85,11 +85,3 @@ def test_a_file_that_changes_meanwhile_is_refused(town: DividedMap, monkeypatch:
     monkeypatch.setattr(worker, "make_layer", slowly)
     with pytest.raises(LayerRefused, match="the file changed while it was read"):
         CellMaker(KnownObjects(""), None).make(task)
-
-
-def test_a_file_that_is_gone_is_refused_by_its_name(town: DividedMap) -> None:
-    task = task_of(town)
-    os.unlink(task.source.name)
-    with pytest.raises(LayerRefused) as refused:
-        CellMaker(KnownObjects(""), None).make(task)
-    assert task.source.name in refused.value.message

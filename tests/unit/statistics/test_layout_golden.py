@@ -180,11 +180,6 @@ def test_a_damaged_header_is_refused() -> None:
             layout.unpack_header(bytes(damaged))
 
 
-def test_states_never_written_are_left_out() -> None:
-    assert layout.unpack_state(bytes(64)) is None
-    assert layout.unpack_identity(bytes(64)) is None
-
-
 @pytest.mark.parametrize(
     ("row", "size", "shown"),
     [

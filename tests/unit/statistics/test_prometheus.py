@@ -15,8 +15,7 @@ from shmmap.segment.directory import ShmDirectory
 from shmmap.statistics.counters import COUNTERS, HISTOGRAMS, OBJECTS_READ, PUBLISHED
 from shmmap.statistics.identity import DaemonIdentity, pid_namespace, start_time_ticks
 from shmmap.statistics.prometheus import exposition
-from shmmap.statistics.reader import read_statistics
-from shmmap.statistics.snapshot import Snapshot
+from shmmap.statistics.reader import Snapshot, read_statistics
 from shmmap.statistics.writer import StatisticsWriter
 
 SAMPLE = re.compile(r'([a-zA-Z_:][a-zA-Z0-9_:]*)\{((?:[a-zA-Z_]\w*="(?:[^"\\\n]|\\["\\n])*",?)*)\} (\S+)')

@@ -37,11 +37,6 @@ def test_no_file_at_all(shm: ShmDirectory, kind: str) -> None:
     os.rmdir(path) if kind == "directory" else os.unlink(path)
 
 
-def test_absent(shm: ShmDirectory) -> None:
-    seen = read_statistics("unit", shm.path)
-    assert (seen.state, seen.identity, seen.counters, seen.cells) == ("absent", None, {}, [])
-
-
 def test_garbage_is_refused(shm: ShmDirectory) -> None:
     path = Path(shm.path, "shmmap.unit.statistics")
     for content in (b"", b"x" * 10, bytes(100_000), os.urandom(100_000)):

@@ -144,21 +144,6 @@ def test_a_successor_s_are_never_taken_away(shm: ShmDirectory, identity: DaemonI
     assert os.listdir(shm.path) == []
 
 
-def test_a_removed_segment_is_no_error_at_the_end(shm: ShmDirectory, identity: DaemonIdentity) -> None:
-    writer = StatisticsWriter(shm, "unit", identity)
-    os.unlink(f"{shm.path}/shmmap.unit.statistics")
-    writer.beat()
-    writer.close()
-
-
-@pytest.mark.parametrize(("mode", "group"), [(0o400, -1), (0o440, os.getgid())])
-def test_mode(shm: ShmDirectory, identity: DaemonIdentity, mode: int, group: int) -> None:
-    writer = StatisticsWriter(shm, "unit", identity, mode=mode, gid=group)
-    status = os.stat(f"{shm.path}/shmmap.unit.statistics")
-    assert (status.st_mode & 0o7777, status.st_gid) == (mode, os.getgid())
-    writer.close()
-
-
 def test_too_long_an_identity_is_refused(shm: ShmDirectory, identity: DaemonIdentity) -> None:
     with pytest.raises(ValueError, match="does not fit"):
         StatisticsWriter(shm, "unit", replace(identity, map_path="/" + "x" * 20000))

@@ -9,14 +9,12 @@ import signal
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import msgspec
 
 from shmmap.segment.directory import ShmDirectory
-from shmmap.statistics import identity as identity_module
 from shmmap.statistics.counters import COUNTERS, HISTOGRAMS, bucket_of
-from shmmap.statistics.identity import DaemonIdentity, WriterProcess, judge, start_time_ticks
+from shmmap.statistics.identity import HUNG_AFTER_S, DaemonIdentity, WriterProcess, start_time_ticks
 from shmmap.statistics.reader import StatisticsReader, read_statistics
 from shmmap.statistics.writer import StatisticsWriter
 from tests.unit.statistics.conftest import client, live_map, row
@@ -142,25 +140,6 @@ def test_live_maps_that_find_no_memory_are_shown_later(shm: ShmDirectory, writer
     assert read_statistics("unit", shm.path).live == [row]
 
 
-def test_a_new_identity(shm: ShmDirectory, writer: StatisticsWriter, identity: DaemonIdentity) -> None:
-    for version in range(8, 12):
-        writer.update_identity(replace(identity, map_version=version))
-        seen = read_statistics("unit", shm.path).identity
-        assert seen is not None
-        assert seen.map_version == version
-
-
-def test_reading_loads_neither_numpy_nor_anything_heavy() -> None:
-    code = (
-        "import sys, shmmap.statistics.reader\n"
-        "print(sorted({'numpy', 'zmq', 'msgspec', 'rich', 'posix_ipc', 'xxhash'} & set(sys.modules)))"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=Path.cwd()
-    )
-    assert done.stdout.strip() == "[]"
-
-
 _SLEEPER = "import sys; print('up', flush=True); sys.stdin.read()"
 
 
@@ -171,26 +150,20 @@ def test_states_of_a_real_process(identity: DaemonIdentity) -> None:
         assert process.stdout is not None
         process.stdout.readline()
         other = replace(identity, pid=process.pid, start_time_ticks=start_time_ticks(process.pid))
-        watched = WriterProcess(other)
-        assert watched.state(0.1) == "healthy"
-        assert WriterProcess(replace(other, start_time_ticks=1)).state(0.1) == "dead"
-        assert WriterProcess(replace(other, pid_namespace=1)).state(0.1) == "healthy"
-        assert judge(other, 0.1) == "healthy"
-        assert watched.state(identity_module.HUNG_AFTER_S + 1) == "hung"
-        assert judge(other, identity_module.HUNG_AFTER_S + 1) == "hung"
-        assert judge(replace(other, start_time_ticks=1), 0.1) == "dead"  # the id was used again
-        process.send_signal(signal.SIGSTOP)
-        os.waitpid(process.pid, os.WUNTRACED)
-        assert judge(other, 0.1) == watched.state(0.1) == "stopped"
-        elsewhere = replace(other, pid_namespace=1)
-        assert judge(elsewhere, 0.1) == "healthy"  # its pid means nothing here: the beat decides
-        assert judge(elsewhere, 100.0) == "hung"
-        process.kill()
-        os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
-        assert judge(other, 0.1) == watched.state(0.1) == "dead"  # not yet waited for: a zombie
-        process.wait()
-        assert judge(other, 0.1) == watched.state(0.1) == "dead"
-        watched.close()
+        elsewhere = WriterProcess(replace(other, pid_namespace=1))  # its pid means nothing here
+        with contextlib.closing(WriterProcess(other)) as watched:
+            assert (watched.state(0.1), watched.state(HUNG_AFTER_S + 1)) == ("healthy", "hung")
+            assert (elsewhere.state(0.1), elsewhere.state(HUNG_AFTER_S + 1)) == ("healthy", "hung")
+            with contextlib.closing(WriterProcess(replace(other, start_time_ticks=1))) as predecessor:
+                assert predecessor.state(0.1) == "dead"  # the id was used again
+            process.send_signal(signal.SIGSTOP)
+            os.waitpid(process.pid, os.WUNTRACED)
+            assert watched.state(0.1) == "stopped"
+            process.kill()
+            os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+            assert watched.state(0.1) == "dead"  # not yet waited for: a zombie
+            process.wait()
+            assert watched.state(0.1) == WriterProcess(other).state(0.1) == "dead"
 
 
 def test_starting_until_it_listens(shm: ShmDirectory, identity: DaemonIdentity) -> None:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from shmmap.cli.screens.map_scene import Scene
     from shmmap.geometry import Area
     from shmmap.protocol.rows import CellRow
-    from shmmap.statistics.snapshot import Snapshot
+    from shmmap.statistics.reader import Snapshot
 
 __all__ = ["add_parser", "run"]
 

@@ -17,7 +17,7 @@ from shmmap.errors import DaemonUnreachable, NoSocket, ProtocolMismatch
 
 if TYPE_CHECKING:
     from shmmap.doctor.verdicts import Finding
-    from shmmap.statistics.snapshot import Snapshot
+    from shmmap.statistics.reader import Snapshot
 
 __all__ = ["add_doctor", "add_health", "add_metrics", "run_doctor", "run_health", "run_metrics"]
 

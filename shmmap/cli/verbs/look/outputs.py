@@ -17,7 +17,7 @@ from shmmap.doctor.verdicts import Finding, cache_verdict
 from shmmap.protocol.messages import ShownCell
 from shmmap.statistics.counters import SPANS
 from shmmap.statistics.identity import DaemonIdentity
-from shmmap.statistics.snapshot import Snapshot
+from shmmap.statistics.reader import Snapshot
 
 __all__ = [
     "Clients",

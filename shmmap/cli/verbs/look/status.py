@@ -38,7 +38,7 @@ from shmmap.errors import DaemonUnreachable
 if TYPE_CHECKING:
     from shmmap.protocol.rows import ClientRow
     from shmmap.statistics.identity import DaemonIdentity
-    from shmmap.statistics.snapshot import Snapshot
+    from shmmap.statistics.reader import Snapshot
 
 __all__ = ["add_clients", "add_status", "run_clients", "run_status"]
 

@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from shmmap.cli.screens.top_screen import Line
-    from shmmap.statistics.reader import StatisticsReader
-    from shmmap.statistics.snapshot import Snapshot
+    from shmmap.statistics.reader import Snapshot, StatisticsReader
 
 __all__ = ["add_parser", "run"]
 

@@ -20,7 +20,7 @@ from shmmap.protocol.rows import CellRow, CellState, ClientRow, LiveMapRow, Wind
 from shmmap.statistics.counters import BUCKETS, COUNTERS, HISTOGRAMS
 from shmmap.statistics.identity import DaemonIdentity
 from shmmap.statistics.layout import State, plan
-from shmmap.statistics.snapshot import Snapshot
+from shmmap.statistics.reader import Snapshot
 
 MIB = 1 << 20
 IDENTITY = DaemonIdentity(

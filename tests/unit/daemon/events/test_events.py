@@ -259,11 +259,10 @@ class Shown:
     """Keeps what would stand in the statistics."""
 
     def __init__(self) -> None:
-        self.rows: Sequence[LiveMapRow] = ()
         self.values: dict[str, int] = {}
 
     def show_live_maps(self, rows: Sequence[LiveMapRow]) -> None:
-        self.rows = rows
+        """Show nothing."""
 
     def set(self, name: str, value: int) -> None:
         self.values[name] = value
@@ -331,12 +330,3 @@ def test_nothing_is_published_before_the_start() -> None:
         (e.LiveStarted, 1, 3), (e.LiveDamaged, "lidar", "a"),
         (e.LiveProblem, "lidar", "chunk 0_0_0 cannot be loaded: torn"),
     ]  # fmt: skip
-
-
-def test_the_statistics_show_them() -> None:
-    one = Published()
-    one.events.update(
-        (ROW, changed(name="radar", damaged=("a", "b"), problem="chunk 0_0_0 cannot be loaded: torn"))
-    )
-    lidar, radar = one.shown.rows
-    assert (lidar, radar.name, radar.damaged) == (ROW, "radar", ("a", "b"))

@@ -17,9 +17,9 @@ from shmmap.daemon.host import memory
 from shmmap.daemon.host.memory import (
     Mount,
     choose_budget,
-    file_system_of,
     loader_bytes,
     memory_limit_bytes,
+    mount_of,
     mounts,
     out_of_memory_kills,
 )
@@ -183,11 +183,6 @@ def test_nothing_there(tmp_path: Path) -> None:
     assert memory_limit_bytes(str(tmp_path)) is None
 
 
-def test_of_this_process() -> None:
-    limit = memory_limit_bytes()
-    assert limit is None or limit > 1 << 20
-
-
 def test_processes_killed_for_lack_of_memory(tmp_path: Path) -> None:
     (tmp_path / "vmstat").write_text("oom_kill_disable 7\nnr_free_pages 1\noom_kill 3\n")
     assert out_of_memory_kills(str(tmp_path / "vmstat")) == 3
@@ -220,12 +215,14 @@ def test_the_innermost_mount_counts_and_the_last_at_one_place(
     (tmp_path / "mountinfo").write_text(LINES)
     found = list(mounts(str(tmp_path / "mountinfo")))
     monkeypatch.setattr(memory, "mounts", lambda: iter(found))
-    assert file_system_of(path) == kind
+    mount = mount_of(path)
+    assert mount is not None
+    assert mount.kind == kind
 
 
 def test_file_systems_of_this_machine() -> None:
-    assert file_system_of("/proc/self") == "proc"
-    assert file_system_of("/dev/shm") == "tmpfs"
+    kinds = [mount.kind for path in ("/proc/self", "/dev/shm") if (mount := mount_of(path)) is not None]
+    assert kinds == ["proc", "tmpfs"]
 
 
 PROGRAM: Final = """

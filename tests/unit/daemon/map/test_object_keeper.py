@@ -13,36 +13,21 @@ from pathlib import Path
 import pytest
 
 from shmmap.daemon.map.object_keeper import THREADS, Kept, KeptCell, ObjectKeeper
-from shmmap.errors import Offline
 from shmmap.origin.remote.object_tier import KeptObjects, ObjectCounts, ObjectTier
 from shmmap.origin.remote.published_object import ObjectName, blob_path
+from tests.support.map_stores import MemoryStore
 
 TIMEOUT_MS = 60_000
 OBJECTS = [random.Random(number).randbytes(5_000 + number) for number in range(20)]
-
-
-class Store:
-    """Objects by path; `Offline` while ``is_away``."""
-
-    url = "memory"
-
-    def __init__(self) -> None:
-        self.objects = {blob_path(hashlib.sha256(data).digest()): data for data in OBJECTS}
-        self.is_away = False
-
-    def get_exactly(self, path: str, nbytes: int) -> memoryview:
-        if self.is_away:
-            raise Offline("away")
-        data = self.objects[path]
-        assert len(data) == nbytes
-        return memoryview(data)
 
 
 class Keeper:
     """A keeper with its store and tier, and how often it found the store away."""
 
     def __init__(self, cache: Path, limit_bytes: int = 1 << 30) -> None:
-        self.store, self.failures = Store(), 0
+        self.store, self.failures = MemoryStore(), 0
+        for data in OBJECTS:
+            self.store.add(data)
         self.tier = ObjectTier(str(cache), limit_bytes=limit_bytes, quiet=True)
         self.keeper = ObjectKeeper(KeptObjects(self.store, self.tier), self.tier, self._failed)
 
@@ -80,7 +65,7 @@ def test_what_is_kept_is_not_fetched_again(one: Keeper) -> None:
     assert one.keep(0, 1) == Kept(key, True)
     size = len(OBJECTS[0]) + len(OBJECTS[1])
     assert one.keeper.counts == ObjectCounts(fetched_objects=2, fetched_bytes=size)
-    one.store.is_away = True
+    one.store.is_out = True
     assert one.keep(0, 1) == Kept(key, True), "and nothing is read or fetched for that"
     assert one.keeper.counts == ObjectCounts(fetched_objects=2, fetched_bytes=size)
     assert one.tier.get(hashlib.sha256(OBJECTS[1]).digest(), len(OBJECTS[1])) == OBJECTS[1]
@@ -88,10 +73,10 @@ def test_what_is_kept_is_not_fetched_again(one: Keeper) -> None:
 
 
 def test_what_cannot_be_had(one: Keeper) -> None:
-    one.store.is_away = True
+    one.store.is_out = True
     assert one.keep(2) == Kept(KeptCell(1, 2, "points"), False)
     assert one.failures == 1
-    one.store.is_away = False
+    one.store.is_out = False
     path = blob_path(hashlib.sha256(OBJECTS[2]).digest())
     one.store.objects[path] = bytes(len(OBJECTS[2]))
     assert not one.keep(2).is_here, "damaged"

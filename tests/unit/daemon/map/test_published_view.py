@@ -5,22 +5,21 @@ from __future__ import annotations
 
 import gc
 import select
-import threading
 import time
 import weakref
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from hashlib import sha256
 from typing import Any, cast
 
 import numpy as np
 import pytest
 
-from shmmap.errors import BadRequest, Offline
+from shmmap.errors import BadRequest
 from shmmap.geometry import Area, AutowareSquare, Box, Circle
 from shmmap.origin.catalogue import Catalogue
 from shmmap.segment.version import cell_version, layer_version
 from tests.support.daemon_process import Deadline
+from tests.support.map_stores import MemoryStore
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 
@@ -49,34 +48,6 @@ Cells = dict[str, tuple[tuple[float, float, float, float], bytes]]
 """By name: box, and content of the points, 32 bytes."""
 
 
-class MemoryStore:
-    """Objects in memory, which can be held back, or out of reach."""
-
-    url = "memory:"
-
-    def __init__(self) -> None:
-        self.objects: dict[str, bytes] = {}
-        self.open = threading.Event()
-        self.open.set()
-        self.is_out = False
-        self.asked: list[str] = []
-
-    def get_exactly(self, path: str, nbytes: int) -> memoryview:
-        self.asked.append(path)
-        assert self.open.wait(TIMEOUT_S)
-        if self.is_out:
-            raise Offline("no answer")
-        data = self.objects[path]
-        assert len(data) == nbytes
-        return memoryview(data)
-
-    def add(self, unpacked: bytes) -> tuple[str, int]:
-        frame = pack_frame(unpacked)
-        digest = sha256(frame).hexdigest()
-        self.objects[f"blobs/sha256/{digest}"] = frame
-        return digest, len(frame)
-
-
 def publish(store: MemoryStore, cells: Cells, builder_version: int = OURS) -> Root:
     names = sorted(cells, key=str.encode)
     boxes = np.array([cells[name][0] for name in names])
@@ -91,11 +62,12 @@ def publish(store: MemoryStore, cells: Cells, builder_version: int = OURS) -> Ro
         objects.set(row, CellSent(row, 1, 0.0, 1.0, layers))
     keys, counts, sizes, digests = [], [], [], []
     for key, shard in divide_into_shards(catalogue, objects, SIDE):
-        digest, size = store.add(pack_shard(shard))
+        frame = pack_frame(pack_shard(shard))
+        digest, size = store.add(frame), len(frame)
         keys.append(key)
         counts.append(len(shard))
         sizes.append(size)
-        digests.append(bytes.fromhex(digest))
+        digests.append(digest)
     low, high = boxes[:, :2], boxes[:, 2:]
     bounds = (*low.min(axis=0).tolist(), *high.max(axis=0).tolist())
     unpacked = pack_root(

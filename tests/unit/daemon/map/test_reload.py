@@ -92,18 +92,6 @@ def test_reading_is_no_change(watch: FileWatch, tmp_path: Path) -> None:
     assert not watch.due(9.0)
 
 
-def test_a_directory_that_comes_later_is_followed(watch: FileWatch, tmp_path: Path) -> None:
-    later = tmp_path / "later"
-    watch.follow([str(later)])  # not there yet
-    later.mkdir()
-    watch.drain(1.0)
-    assert watch.due(2.0)
-    watch.follow([str(later), str(tmp_path)])
-    (later / "a.pcd").write_bytes(b"a")
-    watch.drain(3.0)
-    assert watch.due(4.0)
-
-
 def test_a_directory_that_may_not_be_watched_ends_nothing(watch: FileWatch, tmp_path: Path) -> None:
     """The metadata may name a place that is none: it is looked for again."""
     odd = tmp_path / "odd"

@@ -100,15 +100,6 @@ def test_a_stale_socket_of_another_user(place: Path) -> None:
     assert place.exists()
 
 
-def test_what_others_put_in_its_place_stays(place: Path) -> None:
-    with closing(SocketFile(str(place), -1)) as one:
-        place.unlink()
-        place.write_text("precious")
-        assert not one.is_there
-        one.remove()
-    assert place.read_text() == "precious"
-
-
 def test_a_link_is_no_socket(place: Path, tmp_path: Path) -> None:
     with closing(SocketFile(str(tmp_path / "other.sock"), -1)):
         place.symlink_to(tmp_path / "other.sock")

@@ -53,13 +53,6 @@ def test_any_pieces(messages: list[list[bytes]], cuts: list[int], at_once: int) 
     assert len(receiver.incoming) == 0
 
 
-@pytest.mark.parametrize("size", [0, 255, 256, 70_000])
-def test_frames_of_any_length(size: int) -> None:
-    incoming = Incoming(b"ROUTER", b"DEALER", 1 << 20)
-    incoming.add(GREETING + READY + framed(bytes(size)))
-    assert incoming.messages(9, lambda _data: None) == [(bytes(size), False)]
-
-
 def test_what_the_daemon_sends() -> None:
     """Its type, after the greeting; and a PONG, when asked."""
     receiver = Receiver()

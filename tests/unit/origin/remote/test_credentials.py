@@ -4,11 +4,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from shmmap.errors import ConfigError
-from shmmap.origin.remote.credentials import azure_settings, credentials_source, google_settings, s3_settings
+from shmmap.origin.remote.credentials import credentials_source, find_credentials
 
 SECRET = "hunter2"
 ANONYMOUS = {"region": "us-east-1", "skip_signature": True}
@@ -21,6 +22,18 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+def s3(environment: dict[str, str], **options: bool) -> dict[str, Any]:
+    return find_credentials("s3", environment, **options).settings
+
+
+def google(environment: dict[str, str], **options: bool) -> dict[str, Any]:
+    return find_credentials("gs", environment, **options).settings
+
+
+def azure(environment: dict[str, str], **options: bool) -> dict[str, Any]:
+    return find_credentials("az", environment, **options).settings
+
+
 def profile(path: Path, name: str = "default", key: str = "k", **more: str) -> None:
     lines = [f"[{name}]", f"aws_access_key_id = {key}", f"aws_secret_access_key = {SECRET}"]
     lines += [f"{one} = {value}" for one, value in more.items()]
@@ -29,28 +42,34 @@ def profile(path: Path, name: str = "default", key: str = "k", **more: str) -> N
 
 def test_without_any_the_network_is_not_asked(home: Path) -> None:
     del home
-    assert s3_settings({}) == (ANONYMOUS, None)
-    assert s3_settings({}, instance=True) == ({"region": "us-east-1"}, None)
-    assert google_settings({}) == {"skip_signature": True}
-    assert google_settings({}, instance=True) == {}
-    assert azure_settings({}) == {"skip_signature": True}
-    assert azure_settings({}, instance=True) == {}
+    assert s3({}) == ANONYMOUS
+    assert s3({}, instance=True) == {"region": "us-east-1"}
+    assert google({}) == {"skip_signature": True}
+    assert google({}, instance=True) == {}
+    assert azure({}) == {"skip_signature": True}
+    assert azure({}, instance=True) == {}
 
 
 def test_the_environment_comes_first(home: Path) -> None:
     profile(home / ".aws/credentials")
-    found, provider = s3_settings(
-        {"AWS_ACCESS_KEY_ID": "a", "AWS_SECRET_ACCESS_KEY": "b", "AWS_SESSION_TOKEN": "c", "AWS_REGION": "eu"}
+    found, _, provider = find_credentials(
+        "s3",
+        {
+            "AWS_ACCESS_KEY_ID": "a",
+            "AWS_SECRET_ACCESS_KEY": "b",
+            "AWS_SESSION_TOKEN": "c",
+            "AWS_REGION": "eu",
+        },
     )
     assert found == {"access_key_id": "a", "secret_access_key": "b", "session_token": "c"}
     assert provider is None
-    assert s3_settings({"AWS_SKIP_SIGNATURE": "true"}) == (ANONYMOUS, None)
+    assert s3({"AWS_SKIP_SIGNATURE": "true"}) == ANONYMOUS
     with pytest.raises(ConfigError, match="only together"):
-        s3_settings({"AWS_SECRET_ACCESS_KEY": SECRET})
+        s3({"AWS_SECRET_ACCESS_KEY": SECRET})
 
 
 def keys(environment: dict[str, str]) -> tuple[str, str | None]:
-    found, provider = s3_settings(environment)
+    found, _, provider = find_credentials("s3", environment)
     assert "skip_signature" not in found
     assert provider is not None
     given = provider()
@@ -73,7 +92,7 @@ def test_files_of_profiles(home: Path) -> None:
 
 def test_a_file_that_is_written_again_is_read_again(home: Path) -> None:
     profile(home / ".aws/credentials")
-    _, provider = s3_settings({})
+    provider = find_credentials("s3", {}).provider
     assert provider is not None
     profile(home / ".aws/credentials", key="new")
     assert provider()["access_key_id"] == "new"
@@ -81,10 +100,10 @@ def test_a_file_that_is_written_again_is_read_again(home: Path) -> None:
 
 def test_the_region_of_a_profile(home: Path) -> None:
     (home / ".aws/config").write_text("[default]\nregion = eu-west-1\n[profile fleet]\nregion = us-west-2\n")
-    assert s3_settings({})[0]["region"] == "eu-west-1"
+    assert s3({})["region"] == "eu-west-1"
     profile(home / ".aws/credentials", "fleet")
-    assert s3_settings({"AWS_PROFILE": "fleet"})[0]["region"] == "us-west-2"
-    assert "region" not in s3_settings({"AWS_DEFAULT_REGION": "x"})[0]
+    assert s3({"AWS_PROFILE": "fleet"})["region"] == "us-west-2"
+    assert "region" not in s3({"AWS_DEFAULT_REGION": "x"})
 
 
 @pytest.mark.parametrize(
@@ -96,7 +115,7 @@ def test_the_region_of_a_profile(home: Path) -> None:
 def test_other_kinds_are_refused_by_name(home: Path, line: str, file: str) -> None:
     (home / ".aws" / file).write_text(f"[default]\n{line}\n")
     with pytest.raises(ConfigError) as error:
-        s3_settings({})
+        s3({})
     assert line.split(" ")[0] in str(error.value)
     assert "aws configure export-credentials" in error.value.hint
 
@@ -109,47 +128,47 @@ def test_other_kinds_are_refused_by_name(home: Path, line: str, file: str) -> No
 def test_other_servers_are_asked_for_credentials_only_where_that_is_wanted(home: Path, name: str) -> None:
     del home
     with pytest.raises(ConfigError, match=name) as error:
-        s3_settings({name: "x"})
+        s3({name: "x"})
     assert "--instance-credentials" in error.value.hint
-    assert s3_settings({name: "x"}, instance=True) == ({"region": "us-east-1"}, None)
+    assert s3({name: "x"}, instance=True) == {"region": "us-east-1"}
     given = {name: "x", "AWS_ACCESS_KEY_ID": "a", "AWS_SECRET_ACCESS_KEY": "b"}
-    assert s3_settings(given)[0]["access_key_id"] == "a"
+    assert s3(given)["access_key_id"] == "a"
 
 
 def test_profiles_that_cannot_be_used_are_errors_without_secrets(home: Path) -> None:
     with pytest.raises(ConfigError, match="there is no profile 'fleet'"):
-        s3_settings({"AWS_PROFILE": "fleet"})
+        s3({"AWS_PROFILE": "fleet"})
     credentials = home / ".aws/credentials"
     for text in (f"aws_secret_access_key = {SECRET}\n", f"[default\nkey = {SECRET}\n", f"\xff{SECRET}"):
         credentials.write_text(text, encoding="latin-1")
         with pytest.raises(ConfigError) as error:
-            s3_settings({})
+            s3({})
         assert SECRET not in str(error.value)
     credentials.write_text(f"[default]\naws_secret_access_key = {SECRET}\n")
     with pytest.raises(ConfigError, match="no whole pair") as error:
-        s3_settings({})
+        s3({})
     assert SECRET not in str(error.value)
 
 
 def test_google_and_azure(home: Path) -> None:
-    assert google_settings({"GOOGLE_APPLICATION_CREDENTIALS": "/x"}) == {}
+    assert google({"GOOGLE_APPLICATION_CREDENTIALS": "/x"}) == {}
     (home / "shmmap.google").write_text("{}")
     (home / "shmmap.azure").write_text(
         f"# account\nAZURE_STORAGE_ACCOUNT_NAME=a\nAZURE_STORAGE_SAS_TOKEN={SECRET}\n"
     )
     given = {"CREDENTIALS_DIRECTORY": str(home)}
-    assert google_settings(given) == {"application_credentials": str(home / "shmmap.google")}
-    assert azure_settings(given) == {"account_name": "a", "sas_key": SECRET}
-    assert azure_settings({"AZURE_STORAGE_ACCOUNT_NAME": "a", "AZURE_STORAGE_ACCOUNT_KEY": "k"}) == {
+    assert google(given) == {"application_credentials": str(home / "shmmap.google")}
+    assert azure(given) == {"account_name": "a", "sas_key": SECRET}
+    assert azure({"AZURE_STORAGE_ACCOUNT_NAME": "a", "AZURE_STORAGE_ACCOUNT_KEY": "k"}) == {
         "account_name": "a", "account_key": "k",
     }  # fmt: skip
-    assert azure_settings({"AZURE_STORAGE_ACCOUNT_NAME": "a"}) == {
+    assert azure({"AZURE_STORAGE_ACCOUNT_NAME": "a"}) == {
         "account_name": "a",
         "skip_signature": True,
     }
     (home / "shmmap.azure").write_text(SECRET)
     with pytest.raises(ConfigError) as error:
-        azure_settings(given)
+        azure(given)
     assert SECRET not in str(error.value)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from shmmap.errors import InstanceBusy, MapDataError, MapMissing
+from shmmap.errors import MapDataError, MapMissing
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 
@@ -77,16 +77,6 @@ def test_an_entry_that_was_never_served_is_beside_the_chain(store: Store) -> Non
     assert published(store).version == 3
     assert [one.version for one in earlier_versions(store, require_current(store))] == [3, 1]
     assert list_entries(store) == [1, 2, 3]
-
-
-def test_of_two_publishers_one_wins(store: Store) -> None:
-    for _ in range(2):  # the first version of all, and another one
-        seen = read_current(store)
-        mine, other = (new_entry(store, ROOT, size, seen.current) for size in (1, 2))
-        add_version(store, mine, seen)
-        with pytest.raises(InstanceBusy, match="another publisher has changed"):
-            add_version(store, other, seen)
-        assert require_current(store) == mine.current
 
 
 def test_other_files_among_the_entries_are_left_alone(store: Store) -> None:

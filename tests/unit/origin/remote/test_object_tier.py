@@ -7,7 +7,6 @@ import hashlib
 import logging
 import os
 import random
-import resource
 import shutil
 import socket
 import threading
@@ -191,22 +190,6 @@ def test_removed_at_any_moment(cache: Path, tier: ObjectTier) -> None:
         assert tier.get(NAME, len(DATA)) == DATA
 
 
-def test_a_disk_that_takes_no_more(cache: Path, tier: ObjectTier, caplog: pytest.LogCaptureFixture) -> None:
-    small = DATA[:500]
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
-    try:
-        for _ in range(3):
-            assert not tier.put(NAME, DATA)
-        assert tier.put(hashlib.sha256(small).digest(), small)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert caplog.text.count("objects not kept on disk") == 1
-    assert "File too large" in caplog.text
-    assert not list(cache.rglob(".new-*"))
-    assert tier.put(NAME, DATA), "there is room again"
-
-
 def test_a_file_where_a_directory_should_be(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / "cache").write_text("a file")
     tier = ObjectTier(str(tmp_path / "cache"), limit_bytes=1 << 30)
@@ -387,15 +370,6 @@ def test_without_a_tier_or_without_keeping(origin: Origin, tier: ObjectTier, cac
     objects = KeptObjects(origin, tier, keep=False)
     objects.read(NAME, len(DATA))
     assert objects.counts.disk_objects == 1
-
-
-def test_no_tier_that_cannot_be_used_is_an_error(origin: Origin, tier: ObjectTier, cache: Path) -> None:
-    objects = KeptObjects(origin, tier)
-    objects.read(NAME, len(DATA))
-    (cache / "objects").chmod(0o777)
-    for _ in range(2):
-        assert objects.read(NAME, len(DATA)) == DATA
-    assert objects.counts.fetched_objects == 3
 
 
 def test_many_threads(origin: Origin, cache: Path) -> None:

@@ -29,7 +29,6 @@ from shmmap.origin.remote.published_index import (  # noqa: E402
     pack_root,
     pack_shard,
     published_layer_version,
-    shard_keys,
     unpack_root,
     unpack_shard,
 )
@@ -146,23 +145,6 @@ def test_golden_bytes_of_a_shard() -> None:
     assert pack_shard(shard_of()) == GOLDEN_SHARD
 
 
-def test_a_shard_says_what_each_cell_is() -> None:
-    root = unpack_root(framed(pack_root(root_of(ONE_FRAME))))
-    shard = unpack_shard(ONE_FRAME, root, 0)
-    assert len(shard) == 2
-    assert shard.id(1, root.id_prefix) == "/town/b/0_0.pcd"
-    assert shard.box(0) == (0.0, 0.0, 20.0, 20.0)
-    assert shard.points.tolist() == [5, 0]
-    assert shard.z[0].tolist() == [-1.5, 2.25]
-    name = shard.layers[NDT].name(1)
-    assert (name.sha256, name.size, name.raw) == (bytes(range(132, 164)), 2000, 4096)
-    assert name.content == bytes(range(196, 228))
-    assert name.path == "blobs/sha256/" + bytes(range(132, 164)).hex()
-    identity = shard.identity(0, root)
-    assert (identity.cell_id, identity.frame_id) == ("/town/-20_0.pcd", "map")
-    assert identity.stamp == bytes(range(64, 88))
-
-
 def test_versions_follow_from_content_not_from_names_of_objects() -> None:
     stamp = bytes(range(64, 88))
     version = ONE.version(0, "/town/")
@@ -177,31 +159,6 @@ def test_versions_follow_from_content_not_from_names_of_objects() -> None:
 
 
 # --- areas --------------------------------------------------------------------------------------------
-
-
-def test_shards_near_an_area_have_all_cells_that_touch_it() -> None:
-    rng = np.random.default_rng(4)
-    for trial in range(30):
-        size = float(rng.choice([1.0, 7.5, 20.0]))
-        low = rng.integers(-90, 90, (300, 2)) * size / (1 + trial % 3)
-        boxes = np.hstack([low, low + rng.random((300, 2)) * size * (1 + 9 * (trial % 2))])
-        shard_m = float(rng.choice([2 * size, 10 * size]))
-        keys = shard_keys(boxes, shard_m)
-        present = np.array(sorted({tuple(key) for key in keys.astype(int).tolist()}), np.int32)
-        extents = boxes[:, 2:] - boxes[:, :2]
-        root = root_of(
-            b"", keys=present, shard_m=shard_m,
-            largest_m=tuple(extents.max(axis=0).tolist()),
-            bounds=(*boxes[:, :2].min(axis=0).tolist(), *boxes[:, 2:].max(axis=0).tolist()),
-        )  # fmt: skip
-        for _ in range(30):
-            x, y = rng.uniform(-100 * size, 100 * size, 2).tolist()
-            area = (x, y, x + rng.uniform(0, 30) * size, y + rng.uniform(0, 30) * size)
-            touches = (boxes[:, 0] <= area[2]) & (boxes[:, 2] >= area[0])
-            touches &= (boxes[:, 1] <= area[3]) & (boxes[:, 3] >= area[1])
-            needed = {tuple(key) for key in keys[touches].astype(int).tolist()}
-            found = root.shards_near(area)
-            assert needed <= {tuple(key) for key in root.keys[found].tolist()}
 
 
 def test_only_neighbours_are_asked_below_and_left() -> None:

@@ -201,8 +201,9 @@ def test_what_is_no_url_of_a_map(url: str) -> None:
 @pytest.mark.parametrize("host", ["example.com", "192.168.1.9", "169.254.169.254"])
 def test_plain_http_beyond_this_machine_has_to_be_wanted(host: str, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("obstore", reason="obstore is not installed")
-    with pytest.raises(BadRequest, match="can be read and changed"):
+    with pytest.raises(BadRequest, match="can be read and changed") as caught:
         open_store(f"http://{host}/m")
+    assert "--trust ROOT.json where the map is signed" in caught.value.hint
     open_store(f"http://{host}/m", insecure_http=True)
     monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://{host}:9000")
     with pytest.raises(BadRequest, match="can be read and changed"):

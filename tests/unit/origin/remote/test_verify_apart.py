@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from shmmap.errors import BadRequest, ConfigError, MapDataError, ShmmapError
+from shmmap.errors import ConfigError, ShmmapError
 from shmmap.origin.remote.store import may_be_plain
 from shmmap.origin.remote.verify_apart import VerifySettings, read_trusted_root, verify_apart
 
@@ -65,49 +65,3 @@ def test_which_maps_may_be_read_over_plain_http() -> None:
     for url in ("s3://maps/town", "az://maps/town", "/srv/map", "file:///srv/map"):
         assert not may_be_plain(url, insecure_http=False, trust="ROOT.json")
         assert may_be_plain(url, insecure_http=True, trust="ROOT.json")
-
-
-def test_a_refusal_of_plain_http_says_what_to_do() -> None:
-    pytest.importorskip("obstore", reason="obstore is not installed")
-    from shmmap.origin.remote.opened_store import open_store
-
-    with pytest.raises(BadRequest, match="plain http") as caught:
-        open_store("http://store.invalid/map")
-    assert "--trust ROOT.json where the map is signed" in caught.value.hint
-    open_store("http://store.invalid/map", insecure_http=True)  # nothing is asked of it yet
-
-
-def test_an_offer_is_judged_by_the_latest_time_seen(tmp_path: Path) -> None:
-    """If this machine's clock is behind: what had expired when the timestamp was signed has expired."""
-    pytest.importorskip("tuf", reason="tuf is not installed")
-    from datetime import datetime, timedelta, timezone
-
-    from tuf.api.metadata import Metadata, Timestamp
-
-    import shmmap.publishing.signing as signing
-    from shmmap.origin.remote.map_versions import Current
-    from shmmap.origin.remote.opened_store import DirectoryStore
-    from shmmap.origin.remote.verify_version import verify_version
-
-    store = DirectoryStore(str(tmp_path / "store"))
-    signer = signing.MapSigner(store, str(tmp_path / "keys"))
-    signer.keep(Current(1, "ab" * 32, 77))
-    found = verify_version(store, signer.trusted, str(tmp_path / "state"))
-    now = datetime.now(timezone.utc)
-    assert (found.version, found.root, found.bytes) == (1, "ab" * 32, 77)
-    assert abs(found.signed_s - now.timestamp()) < 60.0
-    assert abs(found.expires_s - (now + signing.LIFETIMES["timestamp"]).timestamp()) < 60.0
-    # a publisher two years ahead: what is valid by this clock was not when it signed
-    later = now + timedelta(days=730)
-    path = Path(store.url) / "timestamp.json"
-    timestamp: Metadata[Timestamp] = Metadata.from_bytes(path.read_bytes())
-    timestamp.signed.version = 2
-    timestamp.signed.expires = later + timedelta(days=7)
-    timestamp.signed.unrecognized_fields["signed"] = f"{later:%Y-%m-%dT%H:%M:%SZ}"
-    timestamp.sign(signer._signers("timestamp")[0])
-    path.write_bytes(timestamp.to_bytes())
-    with pytest.raises(MapDataError, match=r"snapshot\.json was valid until") as caught:
-        verify_version(store, signer.trusted, str(tmp_path / "state"))
-    assert caught.value.cause == "expired"
-    assert f"the timestamp was signed on {later:%Y-%m-%d}" in caught.value.message
-    assert f"this machine's clock says {now:%Y-%m-%d}" in caught.value.message
