@@ -88,6 +88,14 @@ def test_a_session_weighs_less_and_one_that_is_another_s_stays() -> None:
     assert group_niceness() == before
 
 
+@pytest.mark.root
+@pytest.mark.skipif(not os.path.exists("/proc/self/autogroup"), reason="this kernel has no autogroups")
+def test_an_ordinary_user_s_too_though_the_kernel_takes_few_changes_a_second(tmp_path: Path) -> None:
+    user = ["setpriv", "--reuid=61005", "--clear-groups"]
+    for _ in range(3):  # at once: the later ones have to ask again
+        assert weight("session", *user)[0] == LOADER_GROUP_NICENESS
+
+
 def test_what_is_written_and_what_the_kernel_may_say(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "getsid", lambda _: os.getpid())
     assert weigh_less(proc=str(tmp_path)), "there are no such groups: nothing to ask again for"

@@ -7,6 +7,7 @@ import hashlib
 import logging
 import os
 import random
+import resource
 import shutil
 import socket
 import threading
@@ -188,6 +189,22 @@ def test_removed_at_any_moment(cache: Path, tier: ObjectTier) -> None:
         tier.mark_index_used([NAME])
         assert tier.put(NAME, DATA)
         assert tier.get(NAME, len(DATA)) == DATA
+
+
+def test_a_disk_that_takes_no_more(cache: Path, tier: ObjectTier, caplog: pytest.LogCaptureFixture) -> None:
+    small = DATA[:500]
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
+    try:
+        for _ in range(3):
+            assert not tier.put(NAME, DATA)
+        assert tier.put(hashlib.sha256(small).digest(), small)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert caplog.text.count("objects not kept on disk") == 1
+    assert "File too large" in caplog.text
+    assert not list(cache.rglob(".new-*"))
+    assert tier.put(NAME, DATA), "there is room again"
 
 
 def test_a_file_where_a_directory_should_be(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -14,6 +14,8 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from shmmap.errors import CannotWrite
 from shmmap.origin.remote.map_versions import Current
@@ -210,3 +212,15 @@ def test_which_offers_are_taken(offered: Current, accept: int, is_taken: bool, p
 def test_the_first_one_is_taken_whatever_its_number() -> None:
     for offered, accept in itertools.product((Current(1, OTHER, 9), Current(1 << 62, OTHER, 9)), (0, 1, 5)):
         assert judge_offer(None, offered, accept=accept) == Judgement(True)
+
+
+@given(offers=st.lists(st.tuples(st.integers(1, 9), st.sampled_from(["aa" * 32, "bb" * 32])), max_size=20))
+def test_without_a_person_a_version_never_goes_back(offers: list[tuple[int, str]]) -> None:
+    taken: TakenVersion | None = None
+    for version, root in offers:
+        before = taken
+        if judge_offer(taken, Current(version, root, 1)).is_taken:
+            taken = msgspec.structs.replace(TAKEN, version=version, root=root.encode())
+        assert before is None or (taken is not None and taken.version >= before.version)
+        if before is not None and taken is not None and taken.version == before.version:
+            assert taken is before
