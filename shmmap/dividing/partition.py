@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.dividing.cell_files import CellFiles, Slot, write_at
-from shmmap.dividing.kernels import assign_cells, count_cells, scatter_rows
+from shmmap.dividing.kernels import NOWHERE, assign_cells, count_cells, scatter_rows
 from shmmap.dividing.lattice import CellLattice
 from shmmap.dividing.sources import word_view
 from shmmap.errors import BadRequest
@@ -154,7 +154,7 @@ class Partition:
             places = np.cumsum(counts) - counts
         elif kept:
             # points far apart: number only the cells that contain points
-            finite = ix != np.iinfo(np.int32).min
+            finite = ix != NOWHERE
             keys = (iy[finite].astype(np.int64) << 32) + ix[finite]
             found, inverse, numbers = np.unique(keys, return_inverse=True, return_counts=True)
             wheres = np.column_stack(((found << 32) >> 32, found - ((found << 32) >> 32) >> 32))

@@ -2,7 +2,7 @@
 """Read plain text clouds, one point a line: XYZ variants, PTS, and tables with named columns (TXT, CSV, ASC).
 
 Values are separated by white space, commas or semicolons.  Columns are named by a header, a comment or the
-first line (``//X Y Z I R G B``, ``# x y z intensity``, ``x,y,z,ring``); Without names x, y and z are the
+first line (``//X Y Z I R G B``, ``# x y z intensity``, ``x,y,z,ring``).  Without names x, y and z are the
 first three, the others are guessed from their number, and a warning reports the guess.  All values are
 float64.
 """
