@@ -22,13 +22,13 @@ from shmmap.errors import BadRequest
 from shmmap.formats.pcd.writer import pcd_header
 from shmmap.origin.metadata import METADATA_NAME, metadata_text
 
-__all__ = ["CellFiles", "pcd_fields", "raise_open_files_limit", "write_at", "write_metadata"]
+__all__ = ["CellFiles", "Slot", "pcd_fields", "raise_open_files_limit", "write_at", "write_metadata"]
 
 _ALIGNMENT: Final = 64
 _SPARE_DESCRIPTORS: Final = 128
 _MAX_POINTS: Final = (1 << 32) - 1
 
-_Slot = tuple[int, str, int]  # (descriptor or -1, path, offset): place of a cell's next rows
+Slot = tuple[int, str, int]  # (descriptor or -1, path, offset): place of a cell's next rows
 
 
 class CellFiles:
@@ -65,7 +65,7 @@ class CellFiles:
         """Return the path of a cell's file."""
         return os.path.join(self.directory, self.name(*where))
 
-    def reserve(self, where: tuple[int, int], rows: int) -> _Slot:
+    def reserve(self, where: tuple[int, int], rows: int) -> Slot:
         """Reserve places for ``rows`` further rows of a cell.
 
         Raises
@@ -114,16 +114,10 @@ class CellFiles:
 
     def read(self, where: tuple[int, int]) -> NDArray[np.void]:
         """Return all rows of a cell."""
-        rows = np.empty(self.counts[where], self.row)
-        with open(self.path(where), "rb", buffering=0) as file:
-            file.seek(self.header_bytes)
-            view = rows.view(np.uint8).data
-            done = 0
-            while done < len(view):
-                got = file.readinto(view[done:])
-                if not got:
-                    raise OSError(f"{self.path(where)} became shorter")
-                done += got
+        path, count = self.path(where), self.counts[where]
+        rows: NDArray[np.void] = np.fromfile(path, self.row, count, offset=self.header_bytes)
+        if len(rows) < count:
+            raise OSError(f"{path} became shorter")
         return rows
 
     def close(self) -> None:
@@ -132,7 +126,7 @@ class CellFiles:
             os.close(self._descriptors.popitem()[1])
 
 
-def write_at(slot: _Slot, data: Any) -> None:
+def write_at(slot: Slot, data: Any) -> None:
     """Write ``data`` at the place ``slot``."""
     fd, path, offset = slot
     own = fd < 0

@@ -15,7 +15,7 @@ import time
 from typing import Final
 
 from shmmap.dividing.divide import divide
-from shmmap.dividing.settings import DivideSettings
+from shmmap.dividing.settings import DivideSettings, NoProgress
 from shmmap.errors import MapDataError, ShmmapError
 from shmmap.origin.map_report import LINK_NAME, read_report
 from shmmap.processes.start_child import channel_to_parent
@@ -26,7 +26,7 @@ _NICENESS: Final = 10  # clients of the daemon have priority
 _REPORT_EVERY_S: Final = 1.0
 
 
-class _Channel:
+class _Channel(NoProgress):
     """Sends progress and errors as packets to the daemon."""
 
     def __init__(self, channel: socket.socket) -> None:
@@ -43,9 +43,6 @@ class _Channel:
         self._done += points
         if time.monotonic() - self._reported_s >= _REPORT_EVERY_S:
             self._report()
-
-    def done(self, points: int) -> None:
-        del points
 
     def send(self, **fields: object) -> None:
         self._channel.send(json.dumps(fields).encode())

@@ -8,7 +8,7 @@ import json
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any, Final
 
 import numpy as np
@@ -126,6 +126,7 @@ class _Run:
         self._row = with_axes(row, self._frame.axis)
         origin_x, origin_y, _ = self._frame.origin
         self._lattice = lattice.moved(origin_x, origin_y)
+        self._is_encoded = settings.encoding != "binary"
         self._points = sum(source.points for source in self._sources)
 
     def run(self) -> DividedMap:
@@ -133,20 +134,19 @@ class _Run:
         settings, space = self._settings, self._space
         if self._state is None:  # a resumed run has already written much of it
             needed = self._points * self._row.itemsize
-            if settings.encoding != "binary":
+            if self._is_encoded:
                 needed *= 2  # cells as they were read, and in their final encoding
             check_space("the map", needed, space.path, place=f" in {os.path.dirname(space.out)}")
         final = space.directory("map/" + _CELLS)
         self._buckets = self._bucket_lattice() if settings.leaf else self._lattice
-        if settings.leaf:
-            stage = self._cell_files(space.directory("buckets"), lambda x, y: f"{x}_{y}")
-        else:
-            encoded = settings.encoding != "binary"
-            stage = self._cell_files(space.directory("buckets") if encoded else final, self._name)
-        stream = self._read_into(stage)
+        stage = self._cell_files(
+            space.directory("buckets") if settings.leaf or self._is_encoded else final,
+            (lambda x, y: f"{x}_{y}") if settings.leaf else self._name,
+        )
+        read = self._read_into(stage)
         check_unchanged(self._files)
-        self._frame.check(stream.extremes)
-        if not stream.kept:
+        self._frame.check(read.extremes)
+        if not read.kept:
             alone = len(self._files) == 1
             raise MapDataError(
                 f"no finite point in {'it' if alone else 'any of them'}",
@@ -154,7 +154,7 @@ class _Run:
                 cause="no_points",
             )
         cells = self._finish(stage, final)
-        report = self._report(stream, cells)
+        report = self._report(read, cells)
         write_metadata(space.content, self._lattice, settings.prefix, cells.counts)
         write_report(space.content, report)
         if settings.check:
@@ -173,53 +173,93 @@ class _Run:
         self._stack.callback(files.close)
         return files
 
-    def _read_into(self, files: CellFiles) -> _Stream:
-        settings = self._settings
-        threads = worker_count()
-        room = memory_left(settings.memory_bytes)
-        stream = _Stream(self._sources, RowLayout(self._row, self._frame.move))
-        job = self._job()
-        if self._state is not None and not self._restore(self._state, job, stream, files):
-            self._space.empty()
-            self._space.directory("map/" + _CELLS)
-            os.makedirs(files.directory, exist_ok=True)
-        self.resumed = stream.position
-        points = block_points_for(room, self._row.itemsize, threads)
+    def _read_into(self, files: CellFiles) -> Partition:
+        """Read all sources into the files of cells, or what an interrupted run has left of them."""
+        settings, threads = self._settings, worker_count()
+        points = block_points_for(memory_left(settings.memory_bytes), self._row.itemsize, threads)
         points = max(1, min(points, -(-self._points // (2 * threads)) or 1))
-
-        def save(state: dict[str, Any]) -> None:
-            cells = [(ix, iy, rows) for (ix, iy), rows in files.counts.items()]
-            self._space.save({**state, "job": job, "cells": cells})
-
+        job = self._job()
         with Partition(files, self._buckets, block_points=points, threads=threads) as partition:
-            stream.run(partition, self._progress, save=save, every_s=settings.checkpoint_s)
-        return stream
+            self.resumed = self._restore(job, files, partition)
 
-    def _restore(self, state: dict[str, Any], job: dict[str, Any], stream: _Stream, files: CellFiles) -> bool:
-        """Restore ``state``; return False if it belongs to another job, or does not match the files."""
-        if state.get("job") != job:
-            return False
-        try:
-            files.restore((ix, iy, rows) for ix, iy, rows in state["cells"])
-            stream.restore(state)
-        except OSError:
-            files.counts.clear()
-            return False
-        return True
+            def save(position: int) -> None:
+                partition.drain()
+                state = {
+                    "job": job,
+                    "cells": [(ix, iy, rows) for (ix, iy), rows in files.counts.items()],
+                    "position": position,
+                    "kept": partition.kept,
+                    "dropped": partition.dropped,
+                    "extremes": partition.extremes.tolist(),
+                }
+                self._space.save(state)
+
+            self._read(partition, save)
+            partition.drain()
+        return partition
+
+    def _restore(self, job: dict[str, Any], files: CellFiles, partition: Partition) -> int:
+        """Return to the saved state of an interrupted run; return the number of points that it has read.
+
+        0 if there is none, or it is of another job or does not match the files.
+        """
+        state = self._state
+        if state is None:
+            return 0
+        if state.get("job") == job:
+            with contextlib.suppress(OSError):
+                files.restore((ix, iy, rows) for ix, iy, rows in state["cells"])
+                partition.kept, partition.dropped = state["kept"], state["dropped"]
+                partition.extremes = np.array(state["extremes"])
+                return int(state["position"])
+        files.counts.clear()
+        self._space.empty()
+        self._space.directory("map/" + _CELLS)
+        os.makedirs(files.directory, exist_ok=True)
+        return 0
+
+    def _read(self, partition: Partition, save: Callable[[int], None]) -> None:
+        """Read the sources into a partition, from the resumed point on; save the position now and then."""
+        self._progress.stage("dividing", self._points)
+        self._progress.advance(self.resumed)
+        position = skip = self.resumed
+        saved_s = time.monotonic()
+        for source in self._sources:
+            if skip >= source.points:
+                skip -= source.points
+                continue
+            source.begin(RowLayout(self._row, self._frame.move, source.scale), skip)
+            left = source.points - skip
+            skip = 0
+            while left:
+                if time.monotonic() - saved_s >= self._settings.checkpoint_s:
+                    save(position)
+                    saved_s = time.monotonic()
+                buffer = partition.buffer()
+                count = source.read(buffer[:left])
+                if not count:
+                    points = source.points
+                    raise refusal(
+                        "truncated", f"{points} points announced, {points - left} are there", path=source.path
+                    )
+                partition.submit(buffer, count)
+                position += count
+                left -= count
+                self._progress.advance(count)
+            source.close()
 
     def _finish(self, stage: CellFiles, final: str) -> CellFiles:
         settings = self._settings
         room = memory_left(settings.memory_bytes)
         if settings.leaf:
-            later = settings.encoding != "binary"
-            thinned = self._space.directory("thinned") if later else final
+            thinned = self._space.directory("thinned") if self._is_encoded else final
             _empty_directory(thinned)
             cells = self._cell_files(thinned, self._name)
             stage.close()
             voxels = CellLattice.of(settings.leaf, settings.origin).moved(*self._frame.origin[:2])
             thin_out(stage, cells, voxels, self._lattice, room, self._progress)
             stage = cells
-        if settings.encoding != "binary":
+        if self._is_encoded:
             _empty_directory(final)
             stage.close()
             return write_encoded(stage, final, settings.encoding, room, self._progress)
@@ -247,17 +287,17 @@ class _Run:
             "lattice": asdict(self._lattice),
             "buckets": asdict(self._buckets),
             "prefix": settings.prefix,
-            "staged": bool(settings.leaf or settings.encoding != "binary"),
+            "staged": bool(settings.leaf or self._is_encoded),
         }
         loaded: dict[str, Any] = json.loads(json.dumps(job))
         return loaded
 
-    def _report(self, stream: _Stream, cells: CellFiles) -> DividedMap:
+    def _report(self, read: Partition, cells: CellFiles) -> DividedMap:
         notes = [*self._units.notes, *self._frame.notes]
         for source in self._sources:
             notes += [f"{source.path}: {warning}" for warning in source.warnings]
         if not any(GEOGRAPHIC_SYSTEM in note for note in notes):
-            low, high = stream.extremes + self._frame.origin
+            low, high = read.extremes + self._frame.origin
             notes += [warning] if (warning := degrees_warning(low, high)) else []
         where = list(cells.counts)
         notes += far_cells_notes(
@@ -276,13 +316,13 @@ class _Run:
             cells=len(cells.counts),
             points=sum(cells.counts.values()),
             points_read=self._points,
-            dropped=stream.dropped,
+            dropped=read.dropped,
             origin=self._frame.origin,
             cell_size=settings.cell_size,
             leaf=settings.leaf,
             encoding=settings.encoding,
             fields=field_types(self._row),
-            bounds=stream.extremes.tolist() if stream.kept else None,
+            bounds=read.extremes.tolist(),
             sources=[
                 {**asdict(file), "points": source.points}
                 for file, source in zip(self._files, self._sources, strict=True)
@@ -297,89 +337,6 @@ class _Run:
 def _empty_directory(path: str) -> None:
     for name in os.listdir(path):
         os.unlink(os.path.join(path, name))
-
-
-class _Stream:
-    """All inputs as one stream of rows into a `Partition`, resumable from a position.
-
-    Attributes
-    ----------
-    position
-        Points read from all sources together.
-    kept, dropped, extremes
-        As in `Partition`, including those of an interrupted run.
-    """
-
-    def __init__(self, sources: Sequence[Source], layout: RowLayout) -> None:
-        self._sources = sources
-        self._layout = layout
-        self.position = 0
-        self.kept = self.dropped = 0
-        self.extremes = np.array([[np.inf] * 3, [-np.inf] * 3])
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Restore a state that was passed to ``save`` and has been through JSON."""
-        self.position = state["position"]
-        self.kept, self.dropped = state["kept"], state["dropped"]
-        if self.kept:
-            self.extremes = np.array(state["extremes"])
-
-    def run(
-        self,
-        partition: Partition,
-        progress: Progress,
-        *,
-        save: Callable[[dict[str, Any]], None],
-        every_s: float,
-    ) -> None:
-        """Read all from the current position on; call ``save`` with the state every ``every_s`` seconds."""
-        progress.stage("dividing", sum(source.points for source in self._sources))
-        progress.advance(self.position)
-        before = self.kept, self.dropped, self.extremes
-        saved_s = time.monotonic()
-        skip = self.position
-        for source in self._sources:
-            if skip >= source.points:
-                skip -= source.points
-                continue
-            source.begin(replace(self._layout, scale=source.scale), skip)
-            left = source.points - skip
-            skip = 0
-            while left:
-                if time.monotonic() - saved_s >= every_s:
-                    partition.drain()
-                    self._take(partition, before)
-                    save(
-                        {
-                            "position": self.position,
-                            "kept": self.kept,
-                            "dropped": self.dropped,
-                            "extremes": self.extremes.tolist() if self.kept else None,
-                        }
-                    )
-                    saved_s = time.monotonic()
-                buffer = partition.buffer()
-                count = source.read(buffer[:left])
-                if not count:
-                    points = source.points
-                    raise refusal(
-                        "truncated", f"{points} points announced, {points - left} are there", path=source.path
-                    )
-                partition.submit(buffer, count)
-                self.position += count
-                left -= count
-                progress.advance(count)
-            source.close()
-        partition.drain()
-        self._take(partition, before)
-
-    def _take(self, partition: Partition, before: tuple[int, int, Any]) -> None:
-        kept, dropped, extremes = before
-        self.kept = kept + partition.kept
-        self.dropped = dropped + partition.dropped
-        self.extremes = np.array(
-            [np.minimum(extremes[0], partition.extremes[0]), np.maximum(extremes[1], partition.extremes[1])]
-        )
 
 
 def _check_cells(

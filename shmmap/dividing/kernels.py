@@ -59,8 +59,10 @@ def assign_cells(
     lattice
         (size, origin_x, origin_y) in metres; (step, origin_x, origin_y, scale) as integers.
 
-    Returns ------- Number of finite points, then their least and greatest ix, and their least and greatest
-    iy.  The number is -1 if some point is more than 2**31 cells or 2**52 units of the lattice away.
+    Returns
+    -------
+    Number of finite points, then their least and greatest ix, and their least and greatest iy.  The number is
+    -1 if some point is more than 2**31 cells or 2**52 units of the lattice away.
     """
     size, origin_x, origin_y, step, first_x, first_y, scale = lattice
     per_metre = 1.0 / size

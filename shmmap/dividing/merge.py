@@ -90,7 +90,9 @@ def merge(
         moves = {path: NO_MOVE if keep_frame else _origin_of(path) for path in names}
         opened: list[tuple[InputFile, Source, _Move]] = []
         for path in names:
-            for file in _checked_inputs(path, out):
+            files = find_inputs([path])
+            check_output_place([path], files, out)
+            for file in files:
                 source = open_source(
                     file.path, memory_bytes=memory_left(_MEMORY_BYTES) // 2, scratch_dir=os.path.dirname(out)
                 )
@@ -136,12 +138,6 @@ def _check_output(out: str, encoding: str, *, force: bool) -> None:
         raise BadRequest(f"encoding {encoding!r} is not one of {', '.join(MERGED_ENCODINGS)}")
     if os.path.isdir(out) or (os.path.lexists(out) and not force):
         raise BadRequest(f"{out} exists", hint="--force replaces a file")
-
-
-def _checked_inputs(path: str, out: str) -> list[InputFile]:
-    files = find_inputs([path])
-    check_output_place([path], files, out)
-    return files
 
 
 def _origin_of(path: str) -> _Move:

@@ -7,11 +7,9 @@ rows, sorted by cell.  Only the second step runs in the order of the blocks.
 
 from __future__ import annotations
 
-import contextlib
 import os
-import threading
-from collections.abc import Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
 from queue import SimpleQueue
 from types import TracebackType
 from typing import Final
@@ -19,8 +17,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.dividing.cell_files import CellFiles, write_at
-from shmmap.dividing.kernels import assign_cells, count_cells, scatter_rows
+from shmmap.dividing.cell_files import CellFiles, Slot, write_at
+from shmmap.dividing.kernels import NOWHERE, assign_cells, count_cells, scatter_rows
 from shmmap.dividing.lattice import CellLattice
 from shmmap.dividing.sources import word_view
 from shmmap.errors import BadRequest
@@ -73,7 +71,6 @@ class Partition:
         self._lattice = lattice.numbers
         self.kept = self.dropped = 0
         self.extremes = np.array([[np.inf] * 3, [-np.inf] * 3])
-        self._block_points = block_points
         self._free: SimpleQueue[Rows] = SimpleQueue()
         for _ in range(threads + 1):
             self._free.put(np.empty(block_points, files.row))
@@ -81,11 +78,9 @@ class Partition:
         for _ in range(threads):
             self._work.put(_Buffers(block_points, files.row))
         self._pool = ThreadPoolExecutor(threads, thread_name_prefix="divide")
-        self._running: set[Future[None]] = set()
-        self._turn = threading.Condition()
-        self._next = self._tickets = 0
-        self._failed = False
-        self._error: BaseException | None = None
+        self._running: deque[Future[None]] = deque()
+        self._placed: Future[None] = Future()  # done once the block submitted last has its places
+        self._placed.set_result(None)
 
     def __enter__(self) -> Partition:
         return self
@@ -93,49 +88,50 @@ class Partition:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is not None:
-            self._fail()
         self._pool.shutdown(wait=True, cancel_futures=kind is not None)
 
     def buffer(self) -> Rows:
-        """Return an empty buffer of `block_points` rows, to be filled and passed to `submit`."""
-        while self._running and self._free.empty():
-            done, self._running = wait(self._running, return_when=FIRST_COMPLETED)
-            self._see(done)
-        return self._free.get()
+        """Return an empty buffer of `block_points` rows; errors of earlier blocks are raised here."""
+        buffer = self._free.get()
+        while self._running and self._running[0].done():
+            self._running.popleft().result()
+        return buffer
 
     def submit(self, buffer: Rows, count: int) -> None:
-        """Divide the first ``count`` rows of a buffer; errors of earlier blocks are raised here."""
-        done = {one for one in self._running if one.done()}
-        self._running -= done
-        self._see(done)
-        ticket = self._tickets
-        self._tickets += 1
-        self._running.add(self._pool.submit(self._divide, ticket, buffer, count))
+        """Divide the first ``count`` rows of a buffer."""
+        before, self._placed = self._placed, Future()
+        self._running.append(self._pool.submit(self._divide, buffer, count, before, self._placed))
 
     def drain(self) -> None:
         """Wait until all submitted rows are written."""
-        done, self._running = self._running, set()
-        wait(done)
-        self._see(done)
+        while self._running:
+            self._running.popleft().result()
 
-    def _see(self, done: set[Future[None]]) -> None:
-        for future in done:
-            error = future.exception()
-            if error is not None:
-                raise self._error or error
-
-    def _divide(self, ticket: int, buffer: Rows, count: int) -> None:
+    def _divide(self, buffer: Rows, count: int, before: Future[None], placed: Future[None]) -> None:
+        """Divide a block; its rows get their places after ``before`` is done, and then ``placed`` is."""
         work = self._work.get()
         try:
-            self._divide_with(work, ticket, buffer, count)
+            try:
+                slots, numbers = self._sort(work, buffer, count, before, placed)
+            finally:
+                self._free.put(buffer)
+            view = work.rows.view(np.uint8).data
+            size = self._files.row.itemsize
+            start = 0
+            for slot, number in zip(slots, numbers, strict=True):
+                write_at(slot, view[start * size : (start + number) * size])
+                start += number
         except BaseException as error:
-            self._fail(error)
+            if not placed.done():
+                placed.set_exception(error)  # the next block fails, too
             raise
         finally:
             self._work.put(work)
 
-    def _divide_with(self, work: _Buffers, ticket: int, buffer: Rows, count: int) -> None:
+    def _sort(
+        self, work: _Buffers, buffer: Rows, count: int, before: Future[None], placed: Future[None]
+    ) -> tuple[list[Slot], list[int]]:
+        """Copy the rows to the work buffer, sorted by cell; return place and number of each cell's rows."""
         rows, ix, iy = buffer[:count], work.ix[:count], work.iy[:count]
         extremes = np.array([[np.inf] * 3, [-np.inf] * 3])
         kept, low_x, high_x, low_y, high_y = assign_cells(
@@ -158,53 +154,26 @@ class Partition:
             places = np.cumsum(counts) - counts
         elif kept:
             # points far apart: number only the cells that contain points
-            finite = ix != np.iinfo(np.int32).min
+            finite = ix != NOWHERE
             keys = (iy[finite].astype(np.int64) << 32) + ix[finite]
             found, inverse, numbers = np.unique(keys, return_inverse=True, return_counts=True)
             wheres = np.column_stack(((found << 32) >> 32, found - ((found << 32) >> 32) >> 32))
             ix[finite], iy[finite] = inverse, 0
             low_x, low_y, width = 0, 0, len(found)
             places = np.cumsum(numbers) - numbers
-        with self._in_order(ticket):
-            slots = [
-                self._files.reserve((ix, iy), number)
-                for (ix, iy), number in zip(wheres.tolist(), numbers.tolist(), strict=True)
-            ]
-            self.kept += kept
-            self.dropped += count - kept
-            np.minimum(self.extremes[0], extremes[0], out=self.extremes[0])
-            np.maximum(self.extremes[1], extremes[1], out=self.extremes[1])
+        before.result()
+        slots = [
+            self._files.reserve((ix, iy), number)
+            for (ix, iy), number in zip(wheres.tolist(), numbers.tolist(), strict=True)
+        ]
+        self.kept += kept
+        self.dropped += count - kept
+        np.minimum(self.extremes[0], extremes[0], out=self.extremes[0])
+        np.maximum(self.extremes[1], extremes[1], out=self.extremes[1])
+        placed.set_result(None)
         if kept:
             scatter_rows(word_view(rows), ix, iy, low_x, low_y, width, places, word_view(work.rows))
-        self._free.put(buffer)
-        view = work.rows.view(np.uint8).data
-        size = self._files.row.itemsize
-        start = 0
-        for slot, number in zip(slots, numbers.tolist(), strict=True):
-            write_at(slot, view[start * size : (start + number) * size])
-            start += number
-
-    def _fail(self, error: BaseException | None = None) -> None:
-        with self._turn:
-            self._failed = True
-            self._error = self._error or error  # the first is the cause, the others its effect
-            self._turn.notify_all()
-
-    @contextlib.contextmanager
-    def _in_order(self, ticket: int) -> Iterator[None]:
-        """Run the part of a block's work that must happen in the order of the blocks."""
-        with self._turn:
-            self._turn.wait_for(lambda: self._failed or self._next == ticket)
-            if self._failed:
-                raise _AbandonedError
-        yield
-        with self._turn:
-            self._next += 1
-            self._turn.notify_all()
-
-
-class _AbandonedError(Exception):
-    """Raised in a block that stops because another block failed."""
+        return slots, numbers.tolist()
 
 
 class _Buffers:

@@ -27,7 +27,7 @@ from xxhash import xxh3_64_hexdigest
 from shmmap.errors import BadRequest, CannotWrite, InternalError, MapMissing, error_from_wire
 from shmmap.formats.cloud import READABLE_SUFFIXES
 from shmmap.formats.coordinate_system import FEET
-from shmmap.formats.durable_file import locked_file
+from shmmap.formats.durable_file import locked_entry, locked_file
 from shmmap.logfmt import log
 from shmmap.origin.catalogue import Catalogue, MapOrigin
 from shmmap.origin.catalogue_bytes import default_cache_directory
@@ -198,19 +198,9 @@ class DividedCloud:
 
     def _hold(self) -> None:
         """Mark the cloud as served by this process until the process ends."""
-        if self._use_lock >= 0:
-            return
-        while True:
-            os.makedirs(self._directory, mode=0o700, exist_ok=True)
-            path = os.path.join(self._directory, _USE_LOCK)
-            fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-            fcntl.flock(fd, fcntl.LOCK_SH)
-            with contextlib.suppress(FileNotFoundError):
-                if os.path.samestat(os.fstat(fd), os.stat(path)):
-                    os.utime(fd)
-                    self._use_lock = fd
-                    return
-            os.close(fd)  # another daemon has just removed it
+        if self._use_lock < 0:
+            self._use_lock = locked_entry(self._directory, _USE_LOCK, fcntl.LOCK_SH, mode=0o700)
+            os.utime(self._use_lock)
 
     def _alone(self) -> contextlib.AbstractContextManager[None]:
         """Wait for the lock without which no daemon divides the cloud."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +38,7 @@ NO_MOVE: Final = (0.0, 0.0, 0.0)
 NO_SCALE: Final = (1.0, 1.0)
 
 Columns = Mapping[str, NDArray[Any]] | NDArray[np.void]
+Blocks = Generator[Mapping[str, NDArray[Any]], None, None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,8 +154,10 @@ _BLOCK_POINTS: Final = 1 << 16  # points of files that need conversion; small en
 _READER_BLOCK_POINTS: Final = 1 << 18  # a few of LAZ's chunks of 50000 points, so that all cores help
 
 
-class Source(Protocol):
+class Source(ABC):
     """A cloud that is read from front to back.
+
+    The file is open only while it is read: a map has more cells than a process may have open files.
 
     Attributes
     ----------
@@ -174,17 +177,22 @@ class Source(Protocol):
         Oddities of the file.
     """
 
-    path: str
-    points: int
-    row: np.dtype[np.void]
-    claimed_bounds: Bound3 | None
-    crs: CoordinateSystem | None
-    scale: tuple[float, float]
-    warnings: tuple[str, ...]
+    claimed_bounds: Bound3 | None = None
+    crs: CoordinateSystem | None = None
+    scale = NO_SCALE
 
+    def __init__(self, path: str, points: int, row: np.dtype[np.void], warnings: tuple[str, ...]) -> None:
+        self.path = path
+        self.points = points
+        self.row = row
+        self.warnings = warnings
+        self._layout = RowLayout(row)
+
+    @abstractmethod
     def begin(self, layout: RowLayout, start: int) -> None:
         """Seek to point ``start``; `read` then returns rows of ``layout``."""
 
+    @abstractmethod
     def read(self, rows: NDArray[np.void]) -> int:
         """Fill ``rows`` with the next points; return their number, smaller than requested only at the end.
 
@@ -194,8 +202,14 @@ class Source(Protocol):
             The data contradicts the header.
         """
 
+    @abstractmethod
     def close(self) -> None:
         """Close the file."""
+
+    def _check_same(self, points: int, row: np.dtype[np.void]) -> None:
+        """Check that the file that was opened again is the one that was looked at."""
+        if points != self.points or row != self.row:
+            raise refusal("changed", "the file changed since it was looked at", path=self.path)
 
 
 def open_source(path: str, *, memory_bytes: int, scratch_dir: str) -> Source:
@@ -222,108 +236,63 @@ def open_source(path: str, *, memory_bytes: int, scratch_dir: str) -> Source:
             if reader.header.encoding == "binary" and floats:
                 return _BinaryPcd(reader)
             return _StreamedPcd(reader, memory_bytes, scratch_dir)
-    return _Blocks(path, suffix)
+    return _OtherFormat(path, suffix)
 
 
 def _open_pcd(path: str) -> PcdReader:
     return PcdReader(path, keep_non_finite=True, block_points=_BLOCK_POINTS)
 
 
-def _changed(path: str) -> MapDataError:
-    return refusal("changed", "the file changed since it was looked at", path=path)
-
-
-class _BinaryPcd:
-    """Binary PCD, whose records are read directly.
-
-    Like other sources it keeps the file open only while reading: a map has more cells than a process may have
-    open files.
-    """
-
-    claimed_bounds: Bound3 | None = None
-    crs: CoordinateSystem | None = None
-    scale = NO_SCALE
+class _BinaryPcd(Source):
+    """Binary PCD, whose records are read directly."""
 
     def __init__(self, reader: PcdReader) -> None:
-        self.path = reader.path
-        self.points = reader.header.points
-        self.warnings = reader.warnings
-        self._reader: PcdReader | None = None
-        self._record = reader.record
-        self.row = with_axes(self._record, reader.columns[0].dtype)
+        super().__init__(reader.path, reader.header.points, _row_of_records(reader), reader.warnings)
+        self._reader = reader
         self._at = 0
-        self._layout = RowLayout(self.row)
         self._direct = False
-        self._staged = np.empty(0, self._record)
+        self._staged = np.empty(0, reader.record)
 
     def begin(self, layout: RowLayout, start: int) -> None:
         self.close()
         self._reader = _open_pcd(self.path)
-        if self._reader.header.points != self.points or self._reader.record != self._record:
-            raise _changed(self.path)
+        self._check_same(self._reader.header.points, _row_of_records(self._reader))
         self._layout, self._at = layout, start
-        self._direct = self.row == self._record and layout.takes_as_is(self.row)
+        self._direct = self.row == self._reader.record and layout.takes_as_is(self.row)
         if not self._direct:
-            self._staged = np.empty(_BLOCK_POINTS, self._record)
+            self._staged = np.empty(_BLOCK_POINTS, self._reader.record)
 
     def read(self, rows: NDArray[np.void]) -> int:
         count = min(len(rows), self.points - self._at)
         if self._direct:
-            self._fill(rows[:count].view(np.uint8))
+            self._reader.read_records(self._at, rows[:count])
         else:
             for start in range(0, count, _BLOCK_POINTS):
                 part = rows[start : min(start + _BLOCK_POINTS, count)]
                 staged = self._staged[: len(part)]
-                self._fill(staged.view(np.uint8), start)
+                self._reader.read_records(self._at + start, staged)
                 self._layout.put(staged, part)
         self._at += count
         return count
 
-    def _fill(self, memory: NDArray[np.uint8], ahead: int = 0) -> None:
-        if self._reader is None:
-            raise ValueError("read before begin")
-        view = memory.data
-        offset = self._reader.header.data_offset + (self._at + ahead) * self._record.itemsize
-        done = 0
-        while done < len(view):
-            try:
-                got = os.preadv(self._reader.fileno(), [view[done:]], offset + done)
-            except OSError as error:
-                raise refusal("unreadable", f"cannot be read: {error.strerror}", path=self.path) from error
-            if not got:
-                raise refusal(
-                    "truncated",
-                    "the file became shorter while being read",
-                    path=self.path,
-                    offset=offset + done,
-                )
-            done += got
-
     def close(self) -> None:
-        if self._reader is not None:
-            self._reader.close()
-        self._reader = None
+        self._reader.close()
+        self._staged = self._staged[:0].copy()
 
 
-class _Stream(ABC):
+class _Stream(Source):
     """Base of sources whose formats yield blocks of columns."""
 
-    claimed_bounds: Bound3 | None = None
-    crs: CoordinateSystem | None = None
-    scale = NO_SCALE
-
-    def __init__(self, path: str, points: int, columns: tuple[ColumnSpec, ...]) -> None:
-        self.path = path
-        self.points = points
-        self.row = _row_of(columns)
-        self.warnings: tuple[str, ...] = ()
-        self._layout = RowLayout(self.row)
-        self._iterator: Iterator[Mapping[str, NDArray[Any]]] = iter(())
+    def __init__(
+        self, path: str, points: int, columns: tuple[ColumnSpec, ...], warnings: tuple[str, ...]
+    ) -> None:
+        super().__init__(path, points, _row_of(columns), warnings)
+        self._iterator = self._blocks(0)
         self._block: Mapping[str, NDArray[Any]] = {}
         self._used = self._length = 0
 
     @abstractmethod
-    def _blocks(self, start: int) -> Iterator[Mapping[str, NDArray[Any]]]:
+    def _blocks(self, start: int) -> Blocks:
         """Yield the columns of one block of points after another, from point ``start`` on."""
 
     def begin(self, layout: RowLayout, start: int) -> None:
@@ -352,10 +321,7 @@ class _Stream(ABC):
         return at
 
     def close(self) -> None:
-        close = getattr(self._iterator, "close", None)
-        if close is not None:
-            close()  # closes the file that the generator has open
-        self._iterator = iter(())
+        self._iterator.close()  # closes the file that the generator has open
         self._block = {}
 
 
@@ -363,46 +329,42 @@ class _StreamedPcd(_Stream):
     """PCD in ascii or binary_compressed, or with integer coordinates."""
 
     def __init__(self, reader: PcdReader, memory_bytes: int, scratch_dir: str) -> None:
-        super().__init__(reader.path, reader.header.points, reader.columns)
-        self._scratch_dir = scratch_dir
         header = reader.header
+        super().__init__(reader.path, header.points, reader.columns, reader.warnings)
+        self._scratch_dir = scratch_dir
         expanded = header.points * header.point_bytes
         packed = os.fstat(reader.fileno()).st_size
         self._expand = header.encoding == "binary_compressed" and expanded + packed > memory_bytes
-        self.warnings = reader.warnings
 
-    def _blocks(self, start: int) -> Iterator[Mapping[str, NDArray[Any]]]:
+    def _blocks(self, start: int) -> Blocks:
         with _open_pcd(self.path) as reader:
-            if reader.header.points != self.points or _row_of(reader.columns) != self.row:
-                raise _changed(self.path)
+            self._check_same(reader.header.points, _row_of(reader.columns))
             if self._expand:
                 yield from expanded_blocks(reader, self._scratch_dir, _BLOCK_POINTS, start)
-                return
-            names = [spec.name for spec in reader.columns]
-            for block in reader.blocks():
-                skipped = min(start, len(block[0]))
-                start -= skipped
-                if skipped < len(block[0]):
-                    yield dict(zip(names, (column[skipped:] for column in block), strict=True))
+            else:
+                yield from reader.named_blocks(start)
 
 
-class _Blocks(_Stream):
+class _OtherFormat(_Stream):
     """Source of all formats other than PCD."""
 
     def __init__(self, path: str, suffix: str) -> None:
         self._suffix = suffix
         with open_blocks(path, suffix) as reader:
-            super().__init__(path, reader.points, reader.columns)
+            super().__init__(path, reader.points, reader.columns, reader.warnings)
             self.claimed_bounds = reader.bounds
             self.crs = reader.crs
-            self.warnings = reader.warnings
 
-    def _blocks(self, start: int) -> Iterator[Mapping[str, NDArray[Any]]]:
+    def _blocks(self, start: int) -> Blocks:
         with open_blocks(self.path, self._suffix) as reader:
-            if reader.points != self.points or _row_of(reader.columns) != self.row:
-                raise _changed(self.path)
+            self._check_same(reader.points, _row_of(reader.columns))
             yield from reader.blocks(_READER_BLOCK_POINTS, start)
             self.warnings = reader.warnings
+
+
+def _row_of_records(reader: PcdReader) -> np.dtype[np.void]:
+    """Return the packed row type of a ``binary`` file, whose fields stay in the file's order."""
+    return with_axes(reader.record, reader.columns[0].dtype)
 
 
 def _row_of(columns: tuple[ColumnSpec, ...]) -> np.dtype[np.void]:

@@ -19,7 +19,7 @@ from types import TracebackType
 from typing import Any, Final
 
 from shmmap.errors import InstanceBusy
-from shmmap.formats.durable_file import flush_directory, writing_errors
+from shmmap.formats.durable_file import flush_directory, locked_entry, writing_errors
 
 __all__ = ["Workspace"]
 
@@ -54,25 +54,12 @@ class Workspace:
         self._keep_failed = keep_failed
         self.content = os.path.join(self.path, "map")
         with writing_errors(self.path):
-            os.makedirs(parent, exist_ok=True)
-            self._lock = self._take()
-
-    def _take(self) -> int:
-        while True:
-            os.makedirs(self.path, exist_ok=True)
-            path = os.path.join(self.path, _LOCK)
-            fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
             try:
-                fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                os.close(fd)
+                self._lock = locked_entry(self.path, _LOCK, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
                 raise InstanceBusy(
-                    f"another run is making {self.out}", hint="wait for it, or choose another output"
+                    f"another run is making {out}", hint="wait for it, or choose another output"
                 ) from None
-            with contextlib.suppress(FileNotFoundError):
-                if os.path.samestat(os.fstat(fd), os.stat(path)):
-                    return fd
-            os.close(fd)  # the previous holder has just removed the directory
 
     def __enter__(self) -> Workspace:
         return self

@@ -13,7 +13,7 @@ from typing import IO, Final
 
 from shmmap.errors import CannotWrite, ShmmapError
 
-__all__ = ["appearing_file", "flush_directory", "locked_file", "writing_errors"]
+__all__ = ["appearing_file", "flush_directory", "locked_entry", "locked_file", "writing_errors"]
 
 _ELSEWHERE: Final = "choose a directory that this user may write to"
 _HINTS: Final = {
@@ -73,6 +73,36 @@ def locked_file(path: str, *, mode: int = 0o600) -> Iterator[None]:
         yield
     finally:
         os.close(fd)
+
+
+def locked_entry(directory: str, name: str, kind: int, *, mode: int = 0o777) -> int:
+    """Lock a file of a directory, and return its descriptor; both are created if missing.
+
+    Its holder may remove the directory; a process that waited meanwhile then locks a new file.
+
+    Parameters
+    ----------
+    kind
+        As in `fcntl.flock`.
+    mode
+        Permissions of a new directory.
+
+    Raises
+    ------
+    BlockingIOError
+        The lock is held, and ``kind`` includes ``LOCK_NB``.
+    """
+    path = os.path.join(directory, name)
+    while True:
+        os.makedirs(directory, mode=mode, exist_ok=True)
+        fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        with contextlib.ExitStack() as undo:
+            undo.callback(os.close, fd)
+            fcntl.flock(fd, kind)
+            with contextlib.suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(fd), os.stat(path)):
+                    undo.pop_all()
+                    return fd
 
 
 def flush_directory(path: str | os.PathLike[str]) -> None:

@@ -287,8 +287,7 @@ class _Parser:
             if new != given[place]:
                 self.warnings.append(f"property {given[place][:_SHOWN]!r} renamed {new[:_SHOWN]!r}")
         return tuple(
-            PcdField(places.get(place) or renamed[place], one.dtype, 1, False, one.name)
-            for place, one in enumerate(scalars)
+            PcdField(places.get(place) or renamed[place], one.dtype) for place, one in enumerate(scalars)
         )
 
     def _check_size(self, header: PlyHeader) -> None:

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from shmmap.columns import ColumnSpec
 from shmmap.formats.coordinate_system import CoordinateSystem
 from shmmap.formats.pcd.body import record_blocks
-from shmmap.formats.pcd.table import FieldTable
+from shmmap.formats.pcd.fields import FieldTable
 from shmmap.formats.ply_header import HEADER_LIMIT_BYTES, PlyElement, PlyHeader, parse_ply_header
 from shmmap.formats.source_file import FileReader, refusal
-from shmmap.formats.text_rows import RowParser, line_ends, whole_lines
+from shmmap.formats.text_rows import RowParser
 
 __all__ = ["PlyReader"]
 
@@ -65,14 +65,6 @@ class PlyReader(FileReader):
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         super().__init__(path)
-        try:
-            head = self._source.peek(min(self._source.size, _FIRST_READ_BYTES))
-            if len(head) < self._source.size and not _HEADER_END.search(head):
-                head = self._source.peek(min(self._source.size, HEADER_LIMIT_BYTES))
-            self._header: PlyHeader = parse_ply_header(head, path=self.path, file_bytes=self._source.size)
-        except BaseException:
-            self.close()
-            raise
         self._table = FieldTable(self._header.fields)
         self._oddities: list[str] = []
         self.crs: CoordinateSystem | None = None
@@ -83,6 +75,13 @@ class PlyReader(FileReader):
         self.encoding = self._header.format
         record = self._table.record
         self._record = record.newbyteorder(">") if self.encoding == "binary_big_endian" else record
+
+    def _read_header(self) -> None:
+        size = self._source.size
+        head = self._source.peek(min(size, _FIRST_READ_BYTES))
+        if len(head) < size and not _HEADER_END.search(head):
+            head = self._source.peek(min(size, HEADER_LIMIT_BYTES))
+        self._header: PlyHeader = parse_ply_header(head, path=self.path, file_bytes=size)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -104,54 +103,45 @@ class PlyReader(FileReader):
         if start >= self.points:
             return
         if self.encoding == "ascii":
-            found = self._ascii_blocks(block_points, start)
-        else:
-            found = self._binary_blocks(block_points, start)
-        names = [spec.name for spec in self.columns]
-        for block in found:
-            yield dict(zip(names, block, strict=True))
-
-    # --- binary -----------------------------------------------------------------------------------
-
-    def _binary_blocks(self, block_points: int, start: int) -> Iterator[Block]:
-        source, vertex = self._source, self._header.vertex
+            yield from self._table.named(self._ascii_blocks(block_points), start)
+            return
         for element in self._header.before:
             if element.has_lists:
                 for _ in self._walked(element, _WALK_BYTES, keep=False):
                     pass
             else:
-                self._skip(element.least_row_bytes * element.count, element)
-        if vertex.has_lists:
-            for rows in self._walked(vertex, block_points, keep=True):
-                skipped = min(start, len(rows) // self._record.itemsize)
-                start -= skipped
-                records = np.frombuffer(rows, self._record)[skipped:]
-                if len(records):
-                    block = self._table.empty_block(len(records))
-                    self._table.put_records(block, records, self.path)
-                    yield block
+                self._skip(element, element.count)
+        if self._header.vertex.has_lists:
+            yield from self._table.named(self._list_blocks(block_points), start)
         else:
-            row_bytes = self._record.itemsize
-            self._check_left(row_bytes * vertex.count, vertex)
-            source.at += row_bytes * start
-            found = record_blocks(source, self.points - start, self._table, self._record, block_points)
-            yield from (block for block, _ in found)
-        if self._header.last and source.left:
-            self._oddities.append(f"{source.left} bytes after the last vertex ignored")
+            self._skip(self._header.vertex, start)
+            left = self.points - start
+            found = record_blocks(self._source, left, self._table, self._record, block_points)
+            yield from self._table.named((block for block, _ in found), 0)
+        if self._header.last and self._source.left:
+            self._oddities.append(f"{self._source.left} bytes after the last vertex ignored")
 
-    def _check_left(self, nbytes: int, element: PlyElement) -> None:
-        if nbytes > self._source.left:
+    # --- binary -----------------------------------------------------------------------------------
+
+    def _skip(self, element: PlyElement, rows: int) -> None:
+        """Skip the first ``rows`` of an element without lists, all of whose rows have to be there."""
+        source, needed = self._source, element.least_row_bytes * element.count
+        if needed > source.left:
             raise refusal(
                 "truncated",
-                f"{element.count} rows of element {element.name[:_SHOWN_NAME]} need {nbytes} bytes,"
-                f" {self._source.left} are left at byte {self._source.at}",
+                f"{element.count} rows of element {element.name[:_SHOWN_NAME]} need {needed} bytes,"
+                f" {source.left} are left at byte {source.at}",
                 path=self.path,
-                offset=self._source.size,
+                offset=source.size,
             )
+        source.at += element.least_row_bytes * rows
 
-    def _skip(self, nbytes: int, element: PlyElement) -> None:
-        self._check_left(nbytes, element)
-        self._source.at += nbytes
+    def _list_blocks(self, block_points: int) -> Iterator[Block]:
+        for rows in self._walked(self._header.vertex, block_points, keep=True):
+            records = np.frombuffer(rows, self._record)
+            block = self._table.empty_block(len(records))
+            self._table.put_records(block, records, self.path)
+            yield block
 
     def _walked(self, element: PlyElement, block_rows: int, *, keep: bool) -> Iterator[bytes]:
         """Walk rows with lists; yield their other values, packed, ``block_rows`` rows at a time.
@@ -211,65 +201,52 @@ class PlyReader(FileReader):
 
     # --- ascii ------------------------------------------------------------------------------------
 
-    def _ascii_blocks(self, block_points: int, start: int) -> Iterator[Block]:
-        parser = RowParser(self.path, self._table)
-        ahead = sum(element.count for element in self._header.before)
-        left = self.points
-        vertex = self._header.vertex
-        for offset, text in whole_lines(self._source, bare_cr=self._header.bare_cr):
-            ends = line_ends(text)
-            line = at = 0
-            while ahead and line < len(ends):
-                ahead -= bool(text[at : int(ends[line])].strip())
-                at = int(ends[line])
-                line += 1
-            while line < len(ends) and left:
-                line = min(line + min(block_points, left), len(ends))
-                stop = int(ends[line - 1])
-                part = text[at:stop]
-                tokens = self._scalars(parser, part, offset + at, vertex) if vertex.has_lists else None
-                block = parser.parse(part, offset + at, tokens)
-                left -= len(block[0])
-                at = stop
-                skipped = min(start, len(block[0]))
-                start -= skipped
-                if skipped < len(block[0]):
-                    yield tuple(column[skipped:] for column in block)
-            if not left:
-                if not self._header.last:
-                    break
-                parser.count_surplus(text[at:])
-        if left:
-            raise refusal(
-                "truncated",
-                f"{self.points} vertices announced, {self.points - left} rows are there",
-                path=self.path,
-                offset=self._source.size,
-            )
+    def _ascii_blocks(self, block_points: int) -> Iterator[Block]:
+        header = self._header
+        if header.vertex.has_lists:
+            parser: RowParser = _ListRowParser(self.path, self._table, header.vertex)
+        else:
+            parser = RowParser(self.path, self._table)
+        yield from parser.blocks(
+            self._source,
+            self.points,
+            block_points,
+            what="vertices",
+            ahead=sum(element.count for element in header.before),
+            last=header.last,
+            bare_cr=header.bare_cr,
+        )
         if parser.surplus:
             self._oddities.append(f"{parser.surplus} lines after the last vertex ignored")
 
-    def _scalars(self, parser: RowParser, text: bytes, offset: int, vertex: PlyElement) -> list[bytes]:
-        """Return the values of properties that are not lists, for rows that contain lists."""
+
+class _ListRowParser(RowParser):
+    """Parses rows that contain lists, and leaves these out."""
+
+    def __init__(self, path: str, table: FieldTable, vertex: PlyElement) -> None:
+        super().__init__(path, table)
+        self._properties = vertex.properties
+
+    def tokens(self, text: bytes, offset: int) -> list[bytes]:
         found: list[bytes] = []
-        row = parser.rows
+        row = self.rows
         for line in text.split(b"\n"):
             words = line.split()
             if words:
                 row += 1
                 place = 0
-                for one in vertex.properties:
+                for one in self._properties:
                     word = words[place] if place < len(words) else b""
                     place += 1
                     if one.counter is None:
                         found.append(word)
                     elif not word.isdigit() or len(word) > 10:
                         shown = word[:_SHOWN_NAME].decode("latin-1")
-                        raise parser.row_error(row, offset, f"{shown!r} is not a number of items")
+                        raise self.row_error(row, offset, f"{shown!r} is not a number of items")
                     else:
                         place += int(word)
                 if place != len(words):
-                    raise parser.row_error(row, offset, f"{len(words)} values, {place} are needed")
+                    raise self.row_error(row, offset, f"{len(words)} values, {place} are needed")
             offset += len(line) + 1
         return found
 

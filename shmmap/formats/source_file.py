@@ -50,28 +50,24 @@ def open_regular(path: str) -> int:
 class FileReader:
     """A reader that keeps a file open until it is closed, or its ``with`` block ends.
 
-    Parameters
-    ----------
-    file
-        A path, or an open file descriptor (which stays open and whose position does not matter).
-    path
-        The name used in messages when ``file`` is a descriptor.
-
     Raises
     ------
     MapDataError
         As `open_regular`.
     """
 
-    def __init__(self, file: str | os.PathLike[str] | int, path: str = "") -> None:
-        self.path = path or (f"<descriptor {file}>" if isinstance(file, int) else os.fspath(file))
-        self._owned = not isinstance(file, int)
-        self._fd = file if isinstance(file, int) else open_regular(self.path)
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = os.fspath(path)
+        self._fd = open_regular(self.path)
         try:
             self._source = SourceFile(self._fd, self.path)
+            self._read_header()
         except BaseException:
             self.close()
             raise
+
+    def _read_header(self) -> None:
+        """Read and check the header; the file is closed if this raises."""
 
     def __enter__(self: _Self) -> _Self:
         return self
@@ -86,8 +82,8 @@ class FileReader:
         return self._fd
 
     def close(self) -> None:
-        """Close the file, unless a descriptor was given."""
-        if self._owned and self._fd >= 0:
+        """Close the file."""
+        if self._fd >= 0:
             os.close(self._fd)
         self._fd = -1
 
@@ -106,10 +102,7 @@ class SourceFile:
     def __init__(self, fd: int, path: str) -> None:
         self._fd = fd
         self.path = path
-        try:
-            self.size = os.fstat(fd).st_size
-        except OSError as error:
-            raise refusal("unreadable", f"cannot be read: {error.strerror}", path=path) from error
+        self.size = os.fstat(fd).st_size
         self.at = 0
         self._hash = xxhash.xxh3_128()
         self._buffer: NDArray[np.uint8] = np.empty(0, np.uint8)
@@ -124,7 +117,7 @@ class SourceFile:
         try:
             return os.pread(self._fd, count, 0)
         except OSError as error:
-            self._unreadable(error)
+            self._unreadable(error, self.at)
 
     def start(self, head: bytes) -> None:
         """Digest ``head``, the first bytes of the file, and continue after them."""
@@ -143,39 +136,35 @@ class SourceFile:
         if len(self._buffer) < count:
             self._buffer = np.empty(count, np.uint8)
         part = self._buffer[:count]
-        self._read_into(part.data)
+        self.read_into(part)
         return part
 
     def read_into(self, part: NDArray[np.uint8]) -> None:
         """Fill ``part`` with the next bytes; errors as in `read`."""
-        self._read_into(part.data)
+        self.read_at(part, self.at)
+        self._hash.update(part.data)
+        self.at += len(part)
+
+    def read_at(self, part: NDArray[np.uint8], offset: int) -> None:
+        """Fill ``part`` with the bytes at ``offset``, without digesting them; errors as in `read`."""
+        view: memoryview[Any] = part.data
+        while view:
+            try:
+                got = os.preadv(self._fd, [view], offset)
+            except OSError as error:
+                self._unreadable(error, offset)
+            if not got:
+                message = "the file became shorter while being read"
+                raise refusal("truncated", message, path=self.path, offset=offset)
+            view, offset = view[got:], offset + got
 
     def digest(self) -> bytes:
         """XXH3-128 of everything read so far."""
         return bytes(self._hash.digest())
 
-    def _read_into(self, view: memoryview[Any]) -> None:
-        at = 0
-        while at < len(view):
-            try:
-                got = os.preadv(self._fd, [view[at:]], self.at + at)
-            except OSError as error:
-                self._unreadable(error)
-            if got == 0:
-                raise refusal(
-                    "truncated",
-                    "the file became shorter while being read",
-                    path=self.path,
-                    offset=self.at + at,
-                )
-            at += got
-        self._hash.update(view)
-        self.at += at
-
-    def _unreadable(self, error: OSError) -> NoReturn:
-        raise refusal(
-            "unreadable", f"cannot be read: {error.strerror}", path=self.path, offset=self.at
-        ) from error
+    def _unreadable(self, error: OSError, offset: int) -> NoReturn:
+        message = f"cannot be read: {error.strerror}"
+        raise refusal("unreadable", message, path=self.path, offset=offset) from error
 
 
 CAUSES: Final[dict[str, str]] = {

@@ -2,7 +2,7 @@
 """Read plain text clouds, one point a line: XYZ variants, PTS, and tables with named columns (TXT, CSV, ASC).
 
 Values are separated by white space, commas or semicolons.  Columns are named by a header, a comment or the
-first line (``//X Y Z I R G B``, ``# x y z intensity``, ``x,y,z,ring``); Without names x, y and z are the
+first line (``//X Y Z I R G B``, ``# x y z intensity``, ``x,y,z,ring``).  Without names x, y and z are the
 first three, the others are guessed from their number, and a warning reports the guess.  All values are
 float64.
 """
@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from shmmap.columns import ColumnSpec, column_names
 from shmmap.errors import MapDataError
 from shmmap.formats.coordinate_system import CoordinateSystem
-from shmmap.formats.pcd.fields import AXES, MAX_FIELDS, PcdField
-from shmmap.formats.pcd.table import FieldTable
+from shmmap.formats.pcd.fields import AXES, MAX_FIELDS, FieldTable, PcdField
 from shmmap.formats.source_file import FileReader, refusal
 from shmmap.formats.text_rows import NUMBER, RowParser, line_ends, whole_lines
 
@@ -81,31 +80,31 @@ class TextReader(FileReader):
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         super().__init__(path)
-        suffix = os.path.splitext(self.path)[1].lower()
-        try:
-            head = self._source.peek(min(self._source.size, _HEAD_BYTES))
-            self._bare_cr = b"\r" in head and b"\n" not in head
-            if self._bare_cr:
-                head = head.replace(b"\r", b"\n")
-            self._layout = _Lines(head, self.path, suffix, self._source.size).layout()
-            places = [(AXES.index(name) if name in AXES else 3) for name in self._layout.names]
-            others = column_names(name for name in self._layout.names if name not in AXES)
-            rest = iter(others)
-            fields = tuple(
-                PcdField(AXES[place] if place < 3 else next(rest), np.dtype("<f8"), 1, False, name)
-                for place, name in zip(places, self._layout.names, strict=True)
-            )
-            self._table = FieldTable(fields)
-            self.points = sum(self._rows(text) for _, text in self._texts())
-            self._check_announced()
-        except BaseException:
-            self.close()
-            raise
         self.columns: tuple[ColumnSpec, ...] = self._table.columns
         self.crs: CoordinateSystem | None = None
         self.bounds: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
         self.encoding = self.version = ""
         self.warnings: tuple[str, ...] = (self._layout.guess,) if self._layout.guess else ()
+
+    def _read_header(self) -> None:
+        head = self._source.peek(min(self._source.size, _HEAD_BYTES))
+        self._bare_cr = b"\r" in head and b"\n" not in head
+        if self._bare_cr:
+            head = head.replace(b"\r", b"\n")
+        suffix = os.path.splitext(self.path)[1].lower()
+        self._layout = _Lines(head, self.path, suffix, self._source.size).layout()
+        others = iter(column_names(name for name in self._layout.names if name not in AXES))
+        names = (name if name in AXES else next(others) for name in self._layout.names)
+        self._table = FieldTable(tuple(PcdField(name, np.dtype("<f8")) for name in names))
+        self.points = sum(self._rows(text) for _, text in self._texts())
+        announced = self._layout.announced
+        if announced is not None and announced != self.points:
+            raise refusal(
+                "truncated" if announced > self.points else "bad_header",
+                f"the first line announces {announced} points, {self.points} lines of points follow",
+                path=self.path,
+                offset=self._source.size if announced > self.points else 0,
+            )
 
     def blocks(self, block_points: int, start: int = 0) -> Iterator[dict[str, NDArray[Any]]]:
         """Yield the columns of the points from ``start`` on, at most ``block_points`` rows at a time.
@@ -116,7 +115,6 @@ class TextReader(FileReader):
             ``bad_row``: the number of values differs from the first row's, or a value is no number.
         """
         parser = RowParser(self.path, self._table, self._line_at)
-        names = [spec.name for spec in self.columns]
         for offset, text in self._texts():
             plain = self._plain(parser, text, offset)
             ends = line_ends(plain)
@@ -126,9 +124,7 @@ class TextReader(FileReader):
                 if start and (rows := self._rows(plain[begin:stop])) <= start:
                     start -= rows
                     continue
-                block = parser.parse(plain[begin:stop], offset + begin)
-                if len(block[0]) > start:
-                    yield dict(zip(names, (column[start:] for column in block), strict=True))
+                yield from self._table.named([parser.parse(plain[begin:stop], offset + begin)], start)
                 start = 0
 
     def _texts(self) -> Iterator[tuple[int, bytes]]:
@@ -162,16 +158,6 @@ class TextReader(FileReader):
                     raise parser.row_error(0, offset + at, f"{_shown(line)} is not {what}")
                 at += len(line) + 1
         return text.replace(separator, b" ")
-
-    def _check_announced(self) -> None:
-        announced = self._layout.announced
-        if announced is not None and announced != self.points:
-            raise refusal(
-                "truncated" if announced > self.points else "bad_header",
-                f"the first line announces {announced} points, {self.points} lines of points follow",
-                path=self.path,
-                offset=self._source.size if announced > self.points else 0,
-            )
 
     def _line_at(self, offset: int) -> int:
         """Return the number, counted from 1, of the line that begins at a byte offset."""

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.errors import MapDataError
-from shmmap.formats.pcd.table import FieldTable
+from shmmap.formats.pcd.fields import FieldTable
 from shmmap.formats.source_file import SourceFile, refusal
 
 __all__ = ["NUMBER", "RowParser", "line_ends", "whole_lines"]
@@ -79,15 +79,61 @@ class RowParser:
                 self.places[field.name] = place
             place += field.count
 
-    def parse(self, text: bytes, offset: int, tokens: list[bytes] | None = None) -> tuple[NDArray[Any], ...]:
-        """Return the columns of the points in ``text``, which starts at byte ``offset`` of the file.
+    def blocks(
+        self,
+        source: SourceFile,
+        points: int,
+        block_points: int,
+        *,
+        what: str = "points",
+        ahead: int = 0,
+        last: bool = True,
+        bare_cr: bool = False,
+    ) -> Iterator[tuple[NDArray[Any], ...]]:
+        """Yield the columns of ``points`` rows of a file, at most ``block_points`` of them at a time.
 
-        ``tokens`` are the values to parse, if lines also contain words that belong to no column.
+        Parameters
+        ----------
+        what
+            Name of the points in messages.
+        ahead
+            Number of rows before them that are left out.
+        last
+            Whether the file ends with the points; then `count_surplus` counts what follows them.
+        bare_cr
+            As in `whole_lines`.
         """
-        if tokens is None:
-            tokens = text.split()
-            if b"#" in text or not self._regular(text, len(tokens)):
-                tokens = self._tokens_line_by_line(text, offset)
+        left = points
+        for offset, text in whole_lines(source, bare_cr=bare_cr):
+            ends = line_ends(text)
+            line = at = 0
+            while ahead and line < len(ends):
+                ahead -= bool(text[at : int(ends[line])].strip())
+                at = int(ends[line])
+                line += 1
+            while line < len(ends) and left:
+                line = min(line + min(block_points, left), len(ends))
+                stop = int(ends[line - 1])
+                block = self.parse(text[at:stop], offset + at)
+                left -= len(block[0])
+                at = stop
+                if len(block[0]):
+                    yield block
+            if not left:
+                if not last:
+                    break
+                self.count_surplus(text[at:])
+        if left:
+            raise refusal(
+                "truncated",
+                f"{points} {what} announced, {points - left} rows are there",
+                path=source.path,
+                offset=source.size,
+            )
+
+    def parse(self, text: bytes, offset: int) -> tuple[NDArray[Any], ...]:
+        """Return the columns of the points in ``text``, which starts at byte ``offset`` of the file."""
+        tokens = self.tokens(text, offset)
         rows = len(tokens) // self.values
         try:
             # Python's literals may contain underscores, numbers in files may not
@@ -96,6 +142,13 @@ class RowParser:
             raise self._bad_row(text, offset, bad) from None
         self.rows += rows
         return block
+
+    def tokens(self, text: bytes, offset: int) -> list[bytes]:
+        """Return all values of the rows in ``text``; other kinds of rows override this."""
+        tokens = text.split()
+        if b"#" in text or not self._regular(text, len(tokens)):
+            return self._tokens_line_by_line(text, offset)
+        return tokens
 
     def count_surplus(self, text: bytes) -> None:
         """Count rows after the last point, ignoring blank and comment lines."""

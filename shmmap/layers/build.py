@@ -37,7 +37,6 @@ from shmmap.segment.version import Source
 from shmmap.segment.writer import SegmentOrigin, write_table
 
 __all__ = [
-    "Derived",
     "Halo",
     "Made",
     "build_layer",
@@ -128,15 +127,24 @@ def _checked(columns: Mapping[str, NDArray[np.generic]]) -> Columns:
 
 
 @dataclass(frozen=True, slots=True)
-class Derived:
-    """Header of a finished segment, and states of the files that were read for it.
+class Made:
+    """A finished segment.
 
-    ``neighbours`` are the stamps of the neighbours' files, in the job's order.
+    Attributes
+    ----------
+    version
+        Version of the layer, for the states of the sources that it was made from.
+    neighbours
+        States of the neighbours' sources that the version covers.
+    cached
+        Whether the layer was read from the cache.
     """
 
     header: SegmentHeader
-    neighbours: tuple[SourceStamp, ...]
-    warnings: tuple[str, ...]
+    version: int
+    neighbours: tuple[SourceStamp, ...] = ()
+    warnings: tuple[str, ...] = ()
+    cached: bool = False
 
 
 def combined_digest(own: bytes, neighbours: Sequence[bytes]) -> bytes:
@@ -151,7 +159,7 @@ def derive(
     *,
     source: CellSource | None = None,
     reserve: Callable[[int], None] | None = None,
-) -> Derived:
+) -> Made:
     """Build a layer of a cell into an empty segment file.
 
     Parameters
@@ -201,7 +209,8 @@ def derive(
         z_max=source.z_max,
         reserve=reserve,
     )
-    return Derived(header, tuple(stamp for stamp, _ in around), warnings)
+    neighbours = tuple(stamp for stamp, _ in around)
+    return Made(header, job.version(spec, header.source, neighbours), neighbours, warnings)
 
 
 @dataclass(slots=True)
@@ -241,8 +250,7 @@ def read_halo(
     seen: list[tuple[SourceStamp, bytes]] = []
     warnings: list[str] = []
     for neighbour in sources:
-        stamp = reader.stamp(neighbour)  # before reading: later it may be that of another file
-        before = SourceStamp.from_token(stamp) if stamp is not None else NO_SOURCE
+        before = _state(reader, neighbour)  # before reading: later it may be that of another file
         try:
             source = reader.read(neighbour, box, ("xyz",))
         except MapDataError as error:
@@ -266,38 +274,17 @@ def read_halo(
     return Halo(np.concatenate(found), tuple(seen), tuple(warnings))
 
 
-@dataclass(frozen=True, slots=True)
-class Made:
-    """A finished segment.
-
-    Attributes
-    ----------
-    version
-        Version of the layer, for the states of the sources that it was made from.
-    neighbours
-        States of the neighbours' sources that the version covers.
-    cached
-        Whether the layer was read from the cache.
-    """
-
-    header: SegmentHeader
-    version: int
-    neighbours: tuple[SourceStamp, ...] = ()
-    warnings: tuple[str, ...] = ()
-    cached: bool = False
-
-
 def cache_key(spec: LayerSpec, job: CellJob) -> CacheKey | None:
     """Return a layer's key for the present state of its sources; None if the cell's file cannot be read."""
-    source = _state(job, job.source)
+    source = _state(job.reader, job.source)
     if source is NO_SOURCE:
         return None
-    return CacheKey(spec, job, source, tuple(_state(job, near.source) for near in job.neighbours))
+    return CacheKey(spec, job, source, tuple(_state(job.reader, near.source) for near in job.neighbours))
 
 
-def _state(job: CellJob, source: Source) -> SourceStamp:
+def _state(reader: SourceReader, source: Source) -> SourceStamp:
     """Return the present state of a source; zeros if it cannot be read."""
-    stamp = job.reader.stamp(source)
+    stamp = reader.stamp(source)
     return SourceStamp.from_token(stamp) if stamp is not None else NO_SOURCE
 
 
@@ -344,22 +331,14 @@ def make_layer(
         version = job.ready or job.version(spec, header.source, ())
         made = Made(header, version, warnings=tuple(warnings))
     else:
-        derived = derive(spec, job, fd, source=source() if source is not None else None, reserve=reserve)
-        version = job.version(spec, derived.header.source, derived.neighbours)
-        made = Made(derived.header, version, derived.neighbours, derived.warnings)
-    if keep and cache is not None and key is not None:
-        _keep(cache, CacheKey(spec, job, made.header.source, made.neighbours), made.header, fd)
+        made = derive(spec, job, fd, source=source() if source is not None else None, reserve=reserve)
+    if keep and cache is not None and cache.writable and key is not None:
+        try:
+            cache.store(CacheKey(spec, job, made.header.source, made.neighbours), made.header, fd)
+        except OSError as error:  # a layer does not fail because the cache's disk is full
+            cache.writable = False
+            log.warning("layers not kept on disk", cache_dir=cache.directory, error=error)
     return made
-
-
-def _keep(cache: LayerCache, key: CacheKey, header: SegmentHeader, fd: int) -> None:
-    if not cache.writable:
-        return
-    try:
-        cache.store(key, header, fd)
-    except OSError as error:  # a layer does not fail because the cache's disk is full
-        cache.writable = False
-        log.warning("layers not kept on disk", cache_dir=cache.directory, error=error)
 
 
 def compile_kernels(*, wait: bool = True) -> None:

@@ -195,15 +195,6 @@ class LayerTable:
         return sum(column.nbytes for column in self.columns.values())
 
 
-def _as_given(values: Parameters) -> Parameters:
-    return values
-
-
-def _no_halo(values: Parameters) -> float:
-    del values
-    return 0.0
-
-
 @dataclass(frozen=True, slots=True)
 class LayerKind:
     """A kind of layer.
@@ -244,8 +235,8 @@ class LayerKind:
     parameters: tuple[Parameter, ...]
     columns: tuple[LayerColumn, ...]
     build: Callable[[PointTable, Parameters], LayerTable]
-    resolve: Callable[[Parameters], Parameters] = _as_given
-    halo_m: Callable[[Parameters], float] = _no_halo
+    resolve: Callable[[Parameters], Parameters] = lambda parameters: parameters
+    halo_m: Callable[[Parameters], float] = lambda _: 0.0
     gives_points: bool = False
     takes_layers: bool = True
     needs: tuple[str, ...] | None = ("xyz",)

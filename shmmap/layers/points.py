@@ -23,7 +23,7 @@ BUILDER_VERSION: Final = 1  # increase it when the same source would give other 
 
 
 def build_points(
-    source: str | int,
+    source: str,
     segment_fd: int,
     *,
     cell_id: str,
@@ -40,7 +40,7 @@ def build_points(
     Parameters
     ----------
     source
-        Path or open descriptor of the PCD file.
+        Path of the PCD file.
     segment_fd
         Empty file on the shared-memory file system, open for reading and writing.  After an error
         its content is undefined.

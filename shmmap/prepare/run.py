@@ -56,30 +56,6 @@ class Prepared:
     failures: list[Failure] = field(default_factory=list)
 
 
-class _Count:
-    """Adds up the workers' reports."""
-
-    def __init__(self, total: int, progress: PrepareProgress) -> None:
-        self._progress = progress
-        self.result = Prepared(total)
-
-    def finished(self, task: CellTask, done: CellDone) -> None:
-        result = self.result
-        for layer in done.layers:
-            result.kept += layer.how == "kept"
-            result.recognised += layer.how == "recognised"
-            result.built += layer.how == "built"
-            result.bytes += layer.bytes
-            if layer.how == "failed":
-                result.failures.append(Failure(task.cell_id, layer.layer, layer.message))
-        self._progress.advance(1)
-
-    def died(self, task: CellTask, how: str) -> None:
-        message = f"{task.source.name}: the worker died of it ({how})"
-        self.result.failures += [Failure(task.cell_id, layer, message) for layer in task.layers]
-        self._progress.advance(1)
-
-
 def prepare_map(
     catalogue: Catalogue,
     layers: Sequence[str],
@@ -113,6 +89,7 @@ def prepare_map(
     versions = LayerVersions(lambda: catalogue)
     recognise = int(not cache.is_empty)
     crowded: list[Failure] = []
+    result = Prepared(len(catalogue))
 
     def tasks() -> Iterator[CellTask]:
         for index in range(len(catalogue)):
@@ -120,20 +97,34 @@ def prepare_map(
             crowded.extend(refused)
             yield task
 
+    def finished(task: CellTask, done: CellDone) -> None:
+        for layer in done.layers:
+            result.kept += layer.how == "kept"
+            result.recognised += layer.how == "recognised"
+            result.built += layer.how == "built"
+            result.bytes += layer.bytes
+            if layer.how == "failed":
+                result.failures.append(Failure(task.cell_id, layer.layer, layer.message))
+        progress.advance(1)
+
+    def died(task: CellTask, how: str) -> None:
+        message = f"{task.source.name}: the worker died of it ({how})"
+        result.failures.extend(Failure(task.cell_id, layer, message) for layer in task.layers)
+        progress.advance(1)
+
     progress.stage("prepare", len(catalogue))
-    count = _Count(len(catalogue), progress)
     TaskPool(
         "shmmap.prepare.worker",
         [cache_dir, str(cache_bytes), str(recognise)],
         workers=max(1, workers),
         decode=decode_done,
-        finished=count.finished,
-        died=count.died,
+        finished=finished,
+        died=died,
     ).run(tasks())
-    count.result.failures += crowded
-    count.result.cache_bytes = cache.budget.trim()
+    result.failures += crowded
+    result.cache_bytes = cache.budget.trim()
     progress.done(len(catalogue))
-    return count.result
+    return result
 
 
 def task_of(

@@ -10,17 +10,18 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from shmmap.errors import MapDataError
 from shmmap.formats.pcd import lzf
+from shmmap.formats.pcd.fields import FieldTable, RawBlock
 from shmmap.formats.pcd.header import PcdHeader
-from shmmap.formats.pcd.table import FieldTable, RawBlock
 from shmmap.formats.source_file import SourceFile, refusal
-from shmmap.formats.text_rows import RowParser, line_ends, whole_lines
+from shmmap.formats.text_rows import RowParser
 
 __all__ = [
     "ascii_blocks",
-    "binary_blocks",
     "check_sizes",
     "compressed_blocks",
+    "decompress",
     "field_arrays",
     "record_blocks",
 ]
@@ -32,13 +33,6 @@ _KEPT_BYTES: Final = 16 << 20  # larger sets of buffers are not kept
 _FIRST_BYTES: Final = 4 << 20  # from this size on numpy asks for huge pages; only touched pages count
 _ALIGNMENT_BYTES: Final = 64
 _idle: list[_Scratch] = []
-
-
-def binary_blocks(
-    source: SourceFile, header: PcdHeader, table: FieldTable, block_points: int
-) -> Iterator[RawBlock]:
-    """Yield blocks of a ``binary`` body: records of all fields, one point after the other."""
-    yield from record_blocks(source, header.points, table, table.record, block_points)
 
 
 def record_blocks(
@@ -66,9 +60,7 @@ def _balanced(points: int, limit: int) -> int:
     return -(-points // blocks)
 
 
-def compressed_blocks(
-    source: SourceFile, header: PcdHeader, table: FieldTable, block_points: int
-) -> Iterator[RawBlock]:
+def compressed_blocks(source: SourceFile, header: PcdHeader, block_points: int) -> Iterator[RawBlock]:
     """Yield blocks of a ``binary_compressed`` body: two uint32 sizes, then LZF over whole fields.
 
     Decompressed, the data is all values of the first field, then all of the second, ...  PCL leaves padding
@@ -83,26 +75,19 @@ def compressed_blocks(
         return
     compressed_bytes, output_bytes = (int(size) for size in source.read(8).view("<u4"))
     with_padding = check_sizes(header, compressed_bytes, output_bytes, left=source.left, path=source.path)
-    at = header.data_offset
-    sound = lzf.reachable(compressed_bytes, output_bytes)
+    table = header.table
     rows = _balanced(header.points, block_points)
     with _borrow_scratch() as scratch:
         shapes = (((output_bytes,), _BYTE), ((rows, 3), table.xyz_dtype))
-        if sound and output_bytes > lzf.TRUST_BYTES:
+        if output_bytes > lzf.TRUST_BYTES:
             packed = source.read(compressed_bytes)
-            sound = lzf.first_error(packed.data, output_bytes) is None
-            if sound:
-                data, xyz = scratch.cut(*shapes)
-        elif sound:
+            if lzf.first_error(packed.data, output_bytes) is not None:
+                raise _not_lzf(header, compressed_bytes, output_bytes, source.path)
+            data, xyz = scratch.cut(*shapes)
+        else:
             data, xyz, packed = scratch.cut(*shapes, ((compressed_bytes,), _BYTE))
             source.read_into(packed)
-        if not sound or not lzf.decompress(packed, data):
-            raise refusal(
-                "bad_lzf",
-                f"{compressed_bytes} bytes do not decompress to {output_bytes}",
-                path=source.path,
-                offset=at + 8,
-            )
+        decompress(packed, data, header, source.path)
         fields = field_arrays(data, header, padded=with_padding)
         for start in range(0, header.points, rows):
             stop = min(start + rows, header.points)
@@ -124,7 +109,7 @@ def check_sizes(header: PcdHeader, compressed_bytes: int, output_bytes: int, *, 
     Raises
     ------
     MapDataError
-        ``bad_lzf`` or ``truncated``.
+        ``bad_lzf`` or ``truncated``; also if no LZF stream of that length becomes so long.
     """
     with_padding = header.points * header.point_bytes
     without = header.points * sum(field.row_bytes for field in header.fields if not field.padding)
@@ -142,7 +127,24 @@ def check_sizes(header: PcdHeader, compressed_bytes: int, output_bytes: int, *, 
             path=path,
             offset=header.data_offset,
         )
+    if not lzf.reachable(compressed_bytes, output_bytes):
+        raise _not_lzf(header, compressed_bytes, output_bytes, path)
     return output_bytes == with_padding
+
+
+def decompress(packed: NDArray[np.uint8], data: NDArray[np.uint8], header: PcdHeader, path: str) -> None:
+    """Decompress the whole body of a file into ``data``, or raise ``bad_lzf``."""
+    if not lzf.decompress(packed, data):
+        raise _not_lzf(header, len(packed), len(data), path)
+
+
+def _not_lzf(header: PcdHeader, compressed_bytes: int, output_bytes: int, path: str) -> MapDataError:
+    return refusal(
+        "bad_lzf",
+        f"{compressed_bytes} bytes do not decompress to {output_bytes}",
+        path=path,
+        offset=header.data_offset + 8,
+    )
 
 
 def field_arrays(data: NDArray[np.uint8], header: PcdHeader, *, padded: bool) -> dict[str, NDArray[Any]]:
@@ -160,7 +162,7 @@ def field_arrays(data: NDArray[np.uint8], header: PcdHeader, *, padded: bool) ->
 
 
 def ascii_blocks(
-    source: SourceFile, header: PcdHeader, table: FieldTable, block_points: int, warnings: list[str]
+    source: SourceFile, header: PcdHeader, block_points: int, warnings: list[str]
 ) -> Iterator[RawBlock]:
     """Yield blocks of an ``ascii`` body: one line per point, values separated by white space.
 
@@ -170,28 +172,9 @@ def ascii_blocks(
         ``bad_row`` with the row (counted from 1) and its byte offset, or ``truncated`` when there
         are fewer rows than points.
     """
-    parser = RowParser(source.path, table)
-    left = header.points
-    for offset, text in whole_lines(source):
-        ends = line_ends(text)
-        line = at = 0
-        while line < len(ends) and left:
-            line = min(line + min(block_points, left), len(ends))
-            stop = int(ends[line - 1])
-            block = parser.parse(text[at:stop], offset + at)
-            left -= len(block[0])
-            at = stop
-            if len(block[0]):
-                yield block, ()
-        parser.count_surplus(text[at:])
-    if left:
-        points = header.points
-        raise refusal(
-            "truncated",
-            f"{points} points announced, {points - left} rows are there",
-            path=source.path,
-            offset=source.size,
-        )
+    parser = RowParser(source.path, header.table)
+    for block in parser.blocks(source, header.points, block_points):
+        yield block, ()
     if parser.skipped:
         warnings.append(f"{parser.skipped} blank or comment lines among the points ignored")
     if parser.surplus:

@@ -1,15 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parse the FIELDS, SIZE, TYPE and COUNT lines of a PCD header: the values of a point."""
+"""The fields of a PCD file, from the lines of its header, and the columns that they become."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-__all__ = ["MAX_FIELDS", "MAX_POINT_BYTES", "PADDING", "FieldProblem", "PcdField", "parse_fields"]
+from shmmap.columns import ColumnSpec
+from shmmap.formats.source_file import refusal
+
+__all__ = [
+    "AXES",
+    "MAX_FIELDS",
+    "MAX_POINT_BYTES",
+    "PADDING",
+    "FieldProblem",
+    "FieldTable",
+    "PcdField",
+    "RawBlock",
+    "parse_fields",
+]
 
 MAX_FIELDS: Final = 1024
 MAX_POINT_BYTES: Final = 1 << 20
@@ -36,22 +51,126 @@ class PcdField:
         Little-endian type of one value.
     count
         Values per point; 0 only for padding.
-    padding
-        True for fields named ``_``, whose bytes mean nothing.
-    file_name
-        The name in the file.
     """
 
     name: str
     dtype: np.dtype[np.generic]
-    count: int
-    padding: bool
-    file_name: str
+    count: int = 1
+
+    @property
+    def padding(self) -> bool:
+        """Whether the field is named ``_``, so that its bytes mean nothing."""
+        return self.name == PADDING
 
     @property
     def row_bytes(self) -> int:
         """Bytes of one point's values."""
         return self.dtype.itemsize * self.count
+
+
+# a block of columns; and x, y and z as contiguous arrays if available
+RawBlock = tuple[tuple[NDArray[Any], ...], tuple[NDArray[Any], ...]]
+
+_EXACT: Final = 1 << 53  # the largest integers that float64 holds exactly
+
+
+class FieldTable:
+    """The columns of a file, and how its fields fill them.
+
+    Attributes
+    ----------
+    columns
+        ``xyz`` first, then every field that is neither padding nor a coordinate, in file order.
+    axes, others
+        The source fields of ``xyz`` and of the other columns.
+    xyz_dtype
+        The smaller of float32 and float64 that holds every coordinate exactly.  64-bit integers become
+        float64 too; `put_axis` refuses values beyond 2**53.
+    axes_are_xyz
+        Whether the coordinates have the type of ``xyz`` already.
+    record
+        Packed type of one point in a ``binary`` file; fields by their unique names, padding skipped.
+    values
+        Values per point in an ``ascii`` file, padding included.
+    """
+
+    def __init__(self, fields: tuple[PcdField, ...]) -> None:
+        self.fields = fields
+        by_name = {field.name: field for field in fields}
+        self.axes: tuple[PcdField, ...] = tuple(by_name[axis] for axis in AXES)
+        self.others: tuple[PcdField, ...] = tuple(
+            field for field in fields if not field.padding and field.name not in AXES
+        )
+        widest = np.result_type(np.float32, *(field.dtype for field in self.axes))
+        self.xyz_dtype: np.dtype[Any] = np.dtype("<f8" if widest.itemsize == 8 else "<f4")
+        self.columns: tuple[ColumnSpec, ...] = (
+            ColumnSpec("xyz", self.xyz_dtype, 3, "m"),
+            *(ColumnSpec(field.name, field.dtype, field.count) for field in self.others),
+        )
+        self.axes_are_xyz = all(field.dtype == self.xyz_dtype for field in self.axes)
+        self.values = sum(field.count for field in fields)
+        self.record = _record_dtype(fields)
+
+    def block_shapes(self, rows: int) -> list[tuple[tuple[int, ...], np.dtype[Any]]]:
+        """Return shape and type of each column in a block of ``rows`` rows."""
+        return [
+            ((rows,) if spec.components == 1 else (rows, spec.components), spec.dtype)
+            for spec in self.columns
+        ]
+
+    def empty_block(self, rows: int) -> tuple[NDArray[Any], ...]:
+        """Return one uninitialised array of ``rows`` rows per column."""
+        return tuple(np.empty(shape, dtype) for shape, dtype in self.block_shapes(rows))
+
+    def put_axis(self, xyz: NDArray[Any], axis: int, values: NDArray[Any], path: str) -> None:
+        """Copy one coordinate into its place.
+
+        Raises
+        ------
+        MapDataError
+            ``coordinate_range`` if a 64-bit integer is too large for float64.
+        """
+        if values.dtype == xyz.dtype:
+            xyz[:, axis] = values
+            return
+        wide = values.dtype.kind in "iu" and values.dtype.itemsize == 8 and len(values) > 0
+        if wide and (int(values.max()) > _EXACT or int(values.min()) < -_EXACT):
+            raise refusal("coordinate_range", f"{AXES[axis]} has integers beyond 2**53", path=path)
+        with np.errstate(invalid="ignore"):  # signalling NaNs would warn
+            xyz[:, axis] = values
+
+    def put_records(self, block: tuple[NDArray[Any], ...], records: NDArray[Any], path: str) -> None:
+        """Copy records, with fields by their unique names, into the columns of a block of equal length."""
+        # one strided copy per axis: copying (N, 3) at once takes four times as long
+        for axis, field in enumerate(self.axes):
+            self.put_axis(block[0], axis, records[field.name], path)
+        for column, field in zip(block[1:], self.others, strict=True):
+            column[...] = records[field.name]
+
+    def named(
+        self, blocks: Iterable[tuple[NDArray[Any], ...]], start: int
+    ) -> Iterator[dict[str, NDArray[Any]]]:
+        """Yield blocks as columns by name, without their first ``start`` rows."""
+        names = [spec.name for spec in self.columns]
+        for block in blocks:
+            rows = len(block[0])
+            if start < rows:
+                yield dict(zip(names, (column[start:] for column in block), strict=True))
+            start = max(0, start - rows)
+
+
+def _record_dtype(fields: tuple[PcdField, ...]) -> np.dtype[Any]:
+    names: list[str] = []
+    formats: list[Any] = []
+    offsets: list[int] = []
+    at = 0
+    for field in fields:
+        if not field.padding:
+            names.append(field.name)
+            formats.append(field.dtype if field.count == 1 else (field.dtype, (field.count,)))
+            offsets.append(at)
+        at += field.row_bytes
+    return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": at})
 
 
 class FieldProblem(Exception):
@@ -64,18 +183,18 @@ class FieldProblem(Exception):
         self.cause = cause
 
 
-@lru_cache(maxsize=64)  # cells of a map share these lines
+@lru_cache(maxsize=64)  # cells of a map share these lines, and so one table
 def parse_fields(
     names: tuple[bytes, ...],
     sizes: tuple[bytes, ...],
     types: tuple[bytes, ...],
     counts: tuple[bytes, ...] | None,
-) -> tuple[tuple[PcdField, ...], tuple[str, ...]]:
+) -> tuple[FieldTable, tuple[str, ...]]:
     """Combine the words of FIELDS, SIZE, TYPE and COUNT (None if missing: all 1).
 
     Returns
     -------
-    The fields in file order, and warnings.
+    The table of the fields in file order, and warnings.
 
     Raises
     ------
@@ -98,13 +217,12 @@ def parse_fields(
             raise FieldProblem(
                 b"TYPE", f"field {file_name!r} is of type {text!r}, which PCD does not have", "bad_type"
             )
-        padding = file_name == PADDING
-        fields.append(PcdField(name, dtype, _count(count, 0 if padding else 1), padding, file_name))
+        fields.append(PcdField(name, dtype, _count(count, 0 if name == PADDING else 1)))
     _check_xyz(fields)
     point_bytes = sum(field.row_bytes for field in fields)
     if point_bytes > MAX_POINT_BYTES:
         raise FieldProblem(b"COUNT", f"a point of {point_bytes} bytes; the limit is {MAX_POINT_BYTES}")
-    return tuple(fields), tuple(warnings)
+    return FieldTable(tuple(fields)), tuple(warnings)
 
 
 def _decode(name: bytes) -> str:

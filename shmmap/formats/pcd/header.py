@@ -14,7 +14,7 @@ import re
 from dataclasses import dataclass
 from typing import Final, NoReturn
 
-from shmmap.formats.pcd.fields import FieldProblem, PcdField, parse_fields
+from shmmap.formats.pcd.fields import FieldProblem, FieldTable, PcdField, parse_fields
 from shmmap.formats.source_file import refusal
 
 __all__ = ["ENCODINGS", "HEADER_LIMIT_BYTES", "IDENTITY_VIEWPOINT", "PcdHeader", "parse_header"]
@@ -39,8 +39,8 @@ class PcdHeader:
 
     Attributes
     ----------
-    fields
-        In file order, padding included.
+    table
+        The fields and their columns; headers of a map's cells share one.
     width, height, points
         As in the file; if they disagree, ``points`` is used and a warning added.
     encoding
@@ -51,13 +51,11 @@ class PcdHeader:
         The text after VERSION, empty if missing.
     data_offset
         Byte offset of the first byte after the DATA line.
-    point_bytes
-        Bytes of one point in ``binary``, padding included.
     warnings
         Oddities that did not prevent reading.
     """
 
-    fields: tuple[PcdField, ...]
+    table: FieldTable
     width: int
     height: int
     points: int
@@ -65,8 +63,17 @@ class PcdHeader:
     viewpoint: tuple[float, float, float, float, float, float, float]
     version: str
     data_offset: int
-    point_bytes: int
     warnings: tuple[str, ...]
+
+    @property
+    def fields(self) -> tuple[PcdField, ...]:
+        """The fields in file order, padding included."""
+        return self.table.fields
+
+    @property
+    def point_bytes(self) -> int:
+        """Bytes of one point in ``binary``, padding included."""
+        return self.table.record.itemsize
 
 
 def parse_header(head: bytes, *, path: str, file_bytes: int) -> PcdHeader:
@@ -102,7 +109,7 @@ def parse_header(head: bytes, *, path: str, file_bytes: int) -> PcdHeader:
     if width * height != points or points > MAX_POINTS:
         return _parse_any(head, path, file_bytes)
     header = PcdHeader(
-        known.fields,
+        known.table,
         width,
         height,
         points,
@@ -110,7 +117,6 @@ def parse_header(head: bytes, *, path: str, file_bytes: int) -> PcdHeader:
         known.viewpoint,
         known.version,
         plain.end(),
-        known.point_bytes,
         (),
     )
     _check_size(header, path, file_bytes)
@@ -131,7 +137,7 @@ _seen: Final[dict[tuple[bytes, ...], PcdHeader]] = {}
 
 
 def _parse_any(head: bytes, path: str, file_bytes: int) -> PcdHeader:
-    if file_bytes == 0 or not head:
+    if not head:
         raise refusal("empty_file", "the file is empty (0 bytes)", path=path, offset=0)
     if head.startswith(_LFS):
         raise refusal(
@@ -157,20 +163,17 @@ class _HeaderParser:
 
     def parse(self) -> PcdHeader:
         data_offset = self._read_lines()
-        fields = self._fields()
+        table = self._table()
         width, height, points = self._extent()
-        encoding = self._encoding()
-        point_bytes = sum(field.row_bytes for field in fields)
         header = PcdHeader(
-            fields=fields,
+            table=table,
             width=width,
             height=height,
             points=points,
-            encoding=encoding,
+            encoding=self._encoding(),
             viewpoint=self._viewpoint(),
             version=b" ".join(self.values.get(b"VERSION", [])).decode("latin-1"),
             data_offset=data_offset,
-            point_bytes=point_bytes,
             warnings=tuple(self.warnings),
         )
         _check_size(header, self.path, self.file_bytes)
@@ -180,14 +183,7 @@ class _HeaderParser:
         raise refusal(cause, message, path=self.path, offset=self.offsets.get(key, 0))
 
     def _read_lines(self) -> int:
-        """Collect the header's lines; return the offset of the first data byte."""
-        offset = self._collect_lines()
-        if offset is None:
-            self._refuse_without_data_line()
-        return offset
-
-    def _collect_lines(self) -> int | None:
-        """Fill ``values``; return None if the header has no DATA line."""
+        """Fill ``values`` from the header's lines; return the offset of the first data byte."""
         head, at, lower, unknown = self.head[:HEADER_LIMIT_BYTES], 0, False, 0
         if head.startswith(_BOM):
             at = len(_BOM)
@@ -222,9 +218,6 @@ class _HeaderParser:
                 if lower:
                     self.warnings.append("header keys are in lower case")
                 return min(at, len(self.head))
-        return None
-
-    def _refuse_without_data_line(self) -> NoReturn:
         if not self.head.strip(b"\0"):
             raise refusal("zero_filled", "nothing but zero bytes", path=self.path, offset=0)
         if not self.values:
@@ -266,10 +259,10 @@ class _HeaderParser:
             self._refuse(key, f"{key.decode()} has {len(words)} values instead of one")
         return self._integer(key, words[0], 0)
 
-    def _fields(self) -> tuple[PcdField, ...]:
+    def _table(self) -> FieldTable:
         counts = self.values.get(b"COUNT")
         try:
-            fields, warnings = parse_fields(
+            table, warnings = parse_fields(
                 tuple(self._need(b"FIELDS")),
                 tuple(self._need(b"SIZE")),
                 tuple(self._need(b"TYPE")),
@@ -278,7 +271,7 @@ class _HeaderParser:
         except FieldProblem as problem:
             self._refuse(problem.key, problem.message, problem.cause)
         self.warnings += warnings
-        return fields
+        return table
 
     def _extent(self) -> tuple[int, int, int]:
         width, height, points = self._single(b"WIDTH"), self._single(b"HEIGHT"), self._single(b"POINTS")
@@ -337,8 +330,7 @@ def _check_size(header: PcdHeader, path: str, file_bytes: int) -> None:
     if header.encoding == "binary":
         needed, what = header.points * header.point_bytes, "bytes of points"
     elif header.encoding == "ascii":
-        values = sum(field.count for field in header.fields)
-        needed, what = header.points * 2 * values - 1, "characters at least"
+        needed, what = header.points * 2 * header.table.values - 1, "characters at least"
     else:
         needed, what = 8 if header.points else 0, "bytes of sizes"
     if needed > left:

@@ -18,11 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.columns import Bounds, ColumnSpec
-from shmmap.formats.pcd import lzf
-from shmmap.formats.pcd.body import ascii_blocks, binary_blocks, check_sizes, compressed_blocks, field_arrays
+from shmmap.formats.pcd.body import (
+    ascii_blocks,
+    check_sizes,
+    compressed_blocks,
+    decompress,
+    field_arrays,
+    record_blocks,
+)
 from shmmap.formats.pcd.fields import AXES
 from shmmap.formats.pcd.header import HEADER_LIMIT_BYTES, PcdHeader, parse_header
-from shmmap.formats.pcd.table import coordinate_dtype, field_table
 from shmmap.formats.source_file import FileReader, refusal
 
 __all__ = [
@@ -43,8 +48,6 @@ class PcdReader(FileReader):
 
     Parameters
     ----------
-    file, path
-        As in `FileReader`.
     keep_non_finite
         Keep points whose x, y or z is NaN or infinite.
     block_points
@@ -71,23 +74,15 @@ class PcdReader(FileReader):
 
     def __init__(
         self,
-        file: str | os.PathLike[str] | int,
+        path: str | os.PathLike[str],
         *,
         keep_non_finite: bool = False,
         block_points: int = 1 << 16,
-        path: str = "",
     ) -> None:
-        super().__init__(file, path)
-        try:
-            self._head = self._read_head()
-            self.header: PcdHeader = parse_header(self._head, path=self.path, file_bytes=self._source.size)
-            self._head = self._head[: self.header.data_offset]
-        except BaseException:
-            self.close()
-            raise
+        super().__init__(path)
         self._keep = keep_non_finite
-        self._block_points = max(1, block_points)
-        self._table = field_table(self.header.fields)
+        self._block_points = block_points
+        self._table = self.header.table
         self._bounds = Bounds()
         self._warnings: list[str] = []
         self.columns: tuple[ColumnSpec, ...] = self._table.columns
@@ -95,14 +90,23 @@ class PcdReader(FileReader):
         self.dropped = 0
         self.digest = b""
 
+    def _read_header(self) -> None:
+        size = self._source.size
+        head = self._source.peek(min(size, _FIRST_READ_BYTES))
+        if len(head) < size and not _DATA_LINE.search(head):
+            head = self._source.peek(min(size, HEADER_LIMIT_BYTES))
+        self.header: PcdHeader = parse_header(head, path=self.path, file_bytes=size)
+        self._head = head[: self.header.data_offset]
+
     @property
     def record(self) -> np.dtype[np.void]:
         """Type of one point in a ``binary`` file: every field by its unique name, padding skipped."""
         return self._table.record
 
-    def put_axis(self, xyz: NDArray[Any], axis: int, values: NDArray[Any]) -> None:
-        """Copy one coordinate to its place, as `FieldTable.put_axis`."""
-        self._table.put_axis(xyz, axis, values, self.path)
+    def read_records(self, first: int, records: NDArray[np.void]) -> None:
+        """Fill ``records``, of type `record`, with the points of a ``binary`` file from ``first`` on."""
+        offset = self.header.data_offset + first * self.record.itemsize
+        self._source.read_at(records.view(np.uint8), offset)
 
     @property
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -132,11 +136,11 @@ class PcdReader(FileReader):
         self._warnings.clear()
         source.start(self._head)
         if header.encoding == "binary":
-            raw = binary_blocks(source, header, self._table, self._block_points)
+            raw = record_blocks(source, header.points, self._table, self.record, self._block_points)
         elif header.encoding == "ascii":
-            raw = ascii_blocks(source, header, self._table, self._block_points, self._warnings)
+            raw = ascii_blocks(source, header, self._block_points, self._warnings)
         else:
-            raw = compressed_blocks(source, header, self._table, self._block_points)
+            raw = compressed_blocks(source, header, self._block_points)
         for block, axes in raw:
             mask = self._bounds.add(block[0], axes)
             if mask is None or self._keep:
@@ -154,17 +158,13 @@ class PcdReader(FileReader):
             source.read(min(source.left, _TAIL_READ_BYTES))
         self.digest = source.digest()
 
-    def _read_head(self) -> bytes:
-        """Return the first bytes of the file, which contain its whole header."""
-        size = self._source.size
-        head = self._source.peek(min(size, _FIRST_READ_BYTES))
-        if len(head) < size and not _DATA_LINE.search(head):
-            head = self._source.peek(min(size, HEADER_LIMIT_BYTES))
-        return head
+    def named_blocks(self, start: int) -> Iterator[dict[str, NDArray[Any]]]:
+        """Yield the columns of the points from ``start`` on, of all that `blocks` yields."""
+        return self._table.named(self.blocks(), start)
 
 
 def expanded_blocks(
-    reader: PcdReader, scratch_dir: str, block_points: int, start: int = 0
+    reader: PcdReader, scratch_dir: str, block_points: int, start: int
 ) -> Iterator[dict[str, NDArray[Any]]]:
     """Yield the columns of the points from ``start`` on, including points that are not finite.
 
@@ -196,21 +196,15 @@ def expanded_blocks(
         os.posix_fallocate(file.fileno(), 0, output_bytes)  # a full disk raises an error, not SIGBUS
         data = np.memmap(file, np.uint8, mode="r+", shape=(output_bytes,))
         packed = np.memmap(reader.path, np.uint8, mode="r", offset=body, shape=(compressed_bytes,))
-        if not lzf.reachable(compressed_bytes, output_bytes) or not lzf.decompress(packed, data):
-            raise refusal(
-                "bad_lzf",
-                f"{compressed_bytes} bytes do not decompress to {output_bytes}",
-                path=reader.path,
-                offset=body,
-            )
+        decompress(packed, data, header, reader.path)
         del packed
         fields = field_arrays(data, header, padded=padded)
-        dtype = coordinate_dtype([fields[axis].dtype for axis in AXES])
         for at in range(start, header.points, block_points):
             stop = min(at + block_points, header.points)
-            block = {"xyz": np.empty((stop - at, 3), dtype)}
+            block = {"xyz": np.empty((stop - at, 3), header.table.xyz_dtype)}
             for axis, name in enumerate(AXES):
-                reader.put_axis(block["xyz"], axis, np.array(fields[name][at:stop]))
+                values = np.array(fields[name][at:stop])
+                header.table.put_axis(block["xyz"], axis, values, reader.path)
             for spec in reader.columns[1:]:
                 block[spec.name] = np.array(fields[spec.name][at:stop])
             yield block

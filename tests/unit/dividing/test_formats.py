@@ -15,7 +15,7 @@ import pytest
 from shmmap.dividing.divide import divide
 from shmmap.dividing.settings import DivideSettings
 from shmmap.errors import MapDataError
-from shmmap.formats.cloud import describe, read_cloud
+from shmmap.formats.cloud import read_cloud
 from shmmap.formats.las_reader import LasReader
 from shmmap.origin.map_report import DividedMap
 from tests.support.cloud_bytes import write_las
@@ -81,34 +81,6 @@ def test_names_of_dimensions_that_pcd_does_not_have(tmp_path: Path) -> None:
     assert list(columns)[-6:] == ["a_b", "a_b_2", "xyz_2", "__2", "_2", "caf\u00e9"]
     for number, name in enumerate(list(columns)[-6:]):
         assert columns[name].tolist() == list(range(100 * number, 100 * number + 20))
-
-
-def test_names_of_ply_properties(tmp_path: Path) -> None:
-    properties = ["x", "y", "z", "intensity", "xyz", "_"]
-    lines = [
-        "ply",
-        "format ascii 1.0",
-        "element vertex 3",
-        *(f"property float {name}" for name in properties),
-    ]
-    rows = [" ".join(str(10 * row + k) for k in range(len(properties))) for row in range(3)]
-    (tmp_path / "in.ply").write_text("\n".join([*lines, "end_header", *rows, ""]))
-    columns = read_cloud(tmp_path / "in.ply").columns
-    assert columns["xyz"].tolist() == [[0, 1, 2], [10, 11, 12], [20, 21, 22]]
-    assert {name: values.tolist() for name, values in columns.items() if name != "xyz"} == {
-        "intensity": [3, 13, 23], "xyz_2": [4, 14, 24], "__2": [5, 15, 25],
-    }  # fmt: skip
-
-
-def test_a_las_cloud_in_memory(tmp_path: Path) -> None:
-    columns = xyzircaedt(300)
-    write_las(tmp_path / "in.las", columns)
-    cloud = read_cloud(tmp_path / "in.las")
-    assert cloud.xyz.dtype == np.float64
-    assert np.abs(cloud.xyz[:, 0] - columns["x"]).max() <= 0.00051
-    assert cloud.columns["channel"].tolist() == columns["channel"].tolist()
-    found = describe(tmp_path / "in.las")
-    assert (found.format, found.points) == ("las", 300)
 
 
 @pytest.mark.parametrize("suffix", ["las", "laz"])

@@ -315,23 +315,14 @@ def test_inspect_divide_and_serve_say_so(tmp_path: Path) -> None:
 def test_a_geographic_system_in_a_las_file(
     tmp_path: Path, model: int | None, named: bool, where: str
 ) -> None:
-    header = laspy.LasHeader(point_format=6, version="1.4")
-    header.scales = np.full(3, 1e-7)
-    record = None
-    if model is not None and where != "keys":
-        plane = 'GEOGCS["WGS 84",DATUM["D"]]' if named else 'PROJCS["UTM 32N",GEOGCS["WGS 84"],UNIT["m",1]]'
-        wkt = {"plain": plane}.get(where, f'COMPD_CS["both",{plane},VERT_CS["h",UNIT["metre",1]]]')
-        record = laspy.vlrs.known.WktCoordinateSystemVlr(wkt)
-        if where != "extended":
-            header.vlrs.append(record)
-    elif model is not None:
-        keys = struct.pack("<4H4H", 1, 1, 0, 1, 1024, 0, 1, model)
-        header.vlrs.append(laspy.VLR("LASF_Projection", 34735, "GeoKeyDirectoryTag", keys))
-    las = laspy.LasData(header)
-    if record is not None and where == "extended":
-        las.evlrs = laspy.vlrs.vlrlist.VLRList([record])
-    las.x, las.y, las.z = np.arange(3.0), np.arange(3.0), np.arange(3.0)
-    las.write(str(tmp_path / "in.las"))
+    plane = 'GEOGCS["WGS 84",DATUM["D"]]' if named else 'PROJCS["UTM 32N",GEOGCS["WGS 84"],UNIT["m",1]]'
+    wkt = {"plain": plane}.get(where, f'COMPD_CS["both",{plane},VERT_CS["h",UNIT["metre",1]]]')
+    write_las(
+        tmp_path / "in.las",
+        wkt="" if model is None or where == "keys" else wkt,
+        records=keys((1024, model)) if model is not None and where == "keys" else None,
+        extended=where == "extended",
+    )
     assert (GEOGRAPHIC_SYSTEM in describe(tmp_path / "in.las").warnings) == named
     made = divide([tmp_path / "in.las"], tmp_path / "map", DivideSettings(durable=False))
     assert any(GEOGRAPHIC_SYSTEM in note for note in made.notes) == named

@@ -59,6 +59,7 @@ def test_separators(tmp_path: Path, separator: str, suffix: str) -> None:
         ("a.xyz", "2\n" + rows(4), ["intensity"], True),
         ("a.txt", rows(4).replace("\n", "\r"), ["intensity"], True),
         ("a.xyz", rows(4)[:-1], ["intensity"], True),
+        ("\udcff.pts", "2\n" + rows(4), ["intensity"], True),  # a name that is not UTF-8
     ],
 )
 def test_columns_are_named(tmp_path: Path, name: str, text: str, columns: list[str], guessed: bool) -> None:
@@ -71,6 +72,7 @@ def test_columns_are_named(tmp_path: Path, name: str, text: str, columns: list[s
         for place, column in enumerate(columns, 3):
             assert cloud.columns[column].tolist() == [row[place] for row in ROWS]
     described = describe(tmp_path / name)
+    assert (described.format, described.points) == (name[2:], cloud.points)
     assert [spec.name for spec in described.columns] == ["xyz", *columns]
     assert described.warnings == cloud.warnings
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shmmap.errors import InternalError, ShmmapError
+from shmmap.errors import ShmmapError
 from shmmap.layers import spec
 from shmmap.layers.contract import LayerColumn, LayerKind, LayerTable, Parameters, PointTable
 from shmmap.testing.layer_conformance import CORNERS, check_layer
@@ -125,4 +125,3 @@ def test_a_kind_needs_a_name_and_a_version() -> None:
         spec.register(replace(GOOD, name="two words"))
     with pytest.raises(ValueError, match="builder_version"):
         spec.register(replace(GOOD, builder_version=256))
-    assert InternalError is not None

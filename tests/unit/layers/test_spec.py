@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shmmap.errors import BadRequest
-from shmmap.layers.spec import canonical_layer, canonical_layers, find_kind, kinds, parse_layer
+from shmmap.layers.spec import canonical_layer, canonical_layers, parse_layer
 
 
 @pytest.mark.parametrize(
@@ -85,12 +85,3 @@ def test_any_text_is_read_or_refused(text: str) -> None:
     except BadRequest:
         return
     assert parse_layer(str(spec)) == spec
-
-
-def test_kinds_describe_themselves() -> None:
-    assert [kind.name for kind in kinds()][:3] == ["points", "voxel", "ndt"]
-    for kind in kinds():
-        assert find_kind(kind.name) is kind
-        assert kind.summary
-        assert kind.borders
-        assert kind.builder_version >= 1

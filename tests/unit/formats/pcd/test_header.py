@@ -36,11 +36,11 @@ def cause(data: bytes) -> str:
 def test_a_plain_header() -> None:
     data = pcd(WITH, "binary")
     found = parse(data)
-    assert [(f.name, f.dtype.str, f.count, f.padding, f.file_name) for f in found.fields] == [
-        ("x", "<f4", 1, False, "x"),
-        ("y", "<f4", 1, False, "y"),
-        ("z", "<f4", 1, False, "z"),
-        ("intensity", "|u1", 1, False, "intensity"),
+    assert [(f.name, f.dtype.str, f.count, f.padding) for f in found.fields] == [
+        ("x", "<f4", 1, False),
+        ("y", "<f4", 1, False),
+        ("z", "<f4", 1, False),
+        ("intensity", "|u1", 1, False),
     ]
     assert (found.width, found.height, found.points, found.point_bytes) == (2, 1, 2, 13)
     assert (found.encoding, found.version, found.warnings) == ("binary", "0.7", ())
