@@ -222,6 +222,7 @@ _AZURE_SECRETS: Final = {"account_key", "sas_key", "client_secret"}
 
 def _azure_credentials(environment: Mapping[str, str], instance: bool) -> Credentials:
     settings: dict[str, Any] = {}
+    variables: dict[str, str] = {}  # that gave each setting
     files = _given_file(environment, AZURE_FILE)
     in_file = {name: value for path in files for name, value in _lines(path).items()}
     found = {**environment, **in_file}
@@ -235,13 +236,14 @@ def _azure_credentials(environment: Mapping[str, str], instance: bool) -> Creden
         "TENANT_ID",
         "ENDPOINT",
     ):
-        value = found.get(f"AZURE_STORAGE_{name}") or found.get(f"AZURE_{name}")
-        if value:
-            settings["sas_key" if name == "SAS_TOKEN" else name.lower()] = value
+        setting = "sas_key" if name == "SAS_TOKEN" else name.lower()
+        for variable in (f"AZURE_{name}", f"AZURE_STORAGE_{name}"):
+            if found.get(variable):
+                settings[setting], variables[setting] = found[variable], variable
     if secrets := sorted(settings.keys() & _AZURE_SECRETS):
-        secret = secrets[0].upper()
-        is_in_file = any(secret in name for name in in_file)
-        source = _named(environment, files[0]) if is_in_file else f"the environment, AZURE_STORAGE_{secret}"
+        variable = variables[secrets[0]]
+        is_in_file = variable in in_file
+        source = _named(environment, files[0]) if is_in_file else f"the environment, {variable}"
         return Credentials(settings, source)
     if instance:
         return Credentials(settings, _INSTANCE)

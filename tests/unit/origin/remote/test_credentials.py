@@ -190,13 +190,15 @@ def test_sources_are_named_and_nothing_else(home: Path, monkeypatch: pytest.Monk
     given.mkdir()
     (given / "shmmap.aws").write_text(f"[default]\naws_access_key_id = a\naws_secret_access_key = {SECRET}\n")
     (given / "shmmap.google").write_text("{}")
-    (given / "shmmap.azure").write_text(f"AZURE_STORAGE_ACCOUNT_KEY={SECRET}\n")
     inside = {"CREDENTIALS_DIRECTORY": str(given)}
     assert source("s3", **inside) == "profile 'default' of $CREDENTIALS_DIRECTORY/shmmap.aws"
     assert source("gs", **inside) == "$CREDENTIALS_DIRECTORY/shmmap.google"
-    assert source("az", **inside) == "$CREDENTIALS_DIRECTORY/shmmap.azure"
+    for secret in ("ACCOUNT_KEY", "SAS_KEY", "SAS_TOKEN"):
+        (given / "shmmap.azure").write_text(f"AZURE_STORAGE_{secret}={SECRET}\n")
+        assert source("az", **inside) == "$CREDENTIALS_DIRECTORY/shmmap.azure"
     assert source("gs", GOOGLE_SERVICE_ACCOUNT="x") == "the environment, GOOGLE_SERVICE_ACCOUNT"
-    assert source("az", AZURE_STORAGE_SAS_KEY="x") == "the environment, AZURE_STORAGE_SAS_KEY"
+    for variable in ("AZURE_STORAGE_SAS_KEY", "AZURE_STORAGE_SAS_TOKEN", "AZURE_CLIENT_SECRET"):
+        assert source("az", **{variable: "x"}) == f"the environment, {variable}"
     assert (
         credentials_source("s3", {}, instance=True) == "the cloud's metadata address (instance_credentials)"
     )
