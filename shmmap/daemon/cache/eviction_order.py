@@ -237,11 +237,6 @@ class EvictionOrder:
         self._tried.clear()
         return [entry.resident for entry in front]
 
-    @property
-    def all_scored(self) -> bool:
-        """Whether all segments have been scored."""
-        return not self.new
-
     def fill(self, score: Score, now_s: float) -> bool:
         """Score some new or no longer deferred segments if few are in order; return whether any were."""
         for resident in (*self.in_grace.due(now_s), *self.deferred.due(now_s)):

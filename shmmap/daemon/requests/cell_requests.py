@@ -232,7 +232,8 @@ class CellRequests:
             found.pages = {page for page in absent if not pages.is_out_of_reach(page)}
             found.reason = "offline" if len(found.pages) < len(absent) else ""
             pages.want(needed, 0.0)
-        return self._cache.at_height(indices.tolist(), area.z)
+        known: list[int] = indices.tolist()
+        return known if area.z is None else self._cache.heights.overlapping(known, area.z)
 
     def release(self, residents: Iterable[Resident]) -> None:
         """Release segments that a client has dropped."""
@@ -386,7 +387,7 @@ class CellRequests:
         """
         cache, warm, found, now_s = self._cache, self._cache.warm.layers, wanted.found, self._now_s()
         if wanted.area is not None and wanted.area.z is not None:
-            inside = set(cache.at_height([index for index, _ in found.cells], wanted.area.z))
+            inside = set(cache.heights.overlapping([index for index, _ in found.cells], wanted.area.z))
             found.cells = [cell for cell in found.cells if cell[0] in inside]
         answer = _Answer()
         yield from wanted.pause(now=wanted.is_large)

@@ -230,7 +230,7 @@ def test_all_of_many_in_order(count: int) -> None:
     for one in some:
         worth.of_number[one.version] = random.random() * 100
         order.new[one] = None
-    while not order.all_scored:
+    while order.new:
         order.score_new(worth.score)
     for one in random.sample(some, count // 3):
         one.last_use_s += 1.0
@@ -247,7 +247,7 @@ def settled(count: int, worth: Worth) -> tuple[EvictionOrder, list[Resident]]:
     for one in some:
         worth.of_number[one.version] = float(one.version)
         order.new[one] = None
-    while not order.all_scored:
+    while order.new:
         order.score_new(worth.score)
     return order, some
 
