@@ -38,7 +38,6 @@ __all__ = ["Closer", "Reclaimer"]
 SMALL_BYTES: Final = 1 << 16
 MAX_WAITING: Final = 64
 """Descriptors that may wait to be closed: clients need descriptors more."""
-THREAD_NAME: Final = "shmmap-freeing"
 
 
 class Closer:
@@ -71,7 +70,7 @@ class Closer:
     def close(self, fd: int, nbytes: int) -> None:
         """Close the descriptor of a segment of ``nbytes`` in the thread."""
         if self._thread is None:
-            self._thread = threading.Thread(target=self._run, name=THREAD_NAME, daemon=True)
+            self._thread = threading.Thread(target=self._run, name="shmmap-freeing", daemon=True)
             before = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
             try:
                 self._thread.start()  # signals are for the serving loop

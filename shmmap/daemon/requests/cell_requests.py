@@ -445,9 +445,8 @@ class CellRequests:
             answer.handles.append(resident.handle if current else resident.stale_handle)
         if refused:
             mine = wanted.session.as_holder(wanted.session.held_bytes, len(wanted.session.held))
-            box, holders = catalogue.box(index), (mine,) if mine.bytes else ()
-            message = self._quota.message
-            answer.failed.append(FailedCell(wire_id, layer, "over_budget", message, holders, box))
+            holders, box = (mine,) if mine.bytes else (), catalogue.box(index)
+            answer.failed.append(FailedCell(wire_id, layer, "over_budget", self._quota.message, holders, box))
         elif not current and failure is not None and not promised:
             holders = _UNNAMED if failure.code in SPACE_CODES else ()
             box = catalogue.box(index)
