@@ -204,7 +204,8 @@ class Adoption:
         index = self.cache.index_of(resident.key.cell_id)
         assert index is not None  # noqa: S101  checked in _why_not
         self.cache.adopt(resident, index)
-        self.misplaced.note(resident.key.cell_id, index, outside)
+        if outside:
+            self.misplaced.note(resident.key.cell_id, index, outside)
         self.loads.check(resident)
 
     def _is_used(self, fd: int) -> bool:

@@ -114,14 +114,6 @@ def test_loads_that_were_begun_in_an_outage_do_not_make_another_one(
     assert found == (True, IN_A_ROW)
 
 
-def test_layers_are_fetched_as_the_client_asks_for_them(prefetching: Callable[..., InnerDaemon]) -> None:
-    one = prefetching()
-    Drive(one, layers=("points", "voxel(0.5)"))
-    one.run_until(lambda: idle(one))
-    kinds = {resident.key.layer for resident in one.ledger.residents() if resident.prefetched}
-    assert len(kinds) == 2
-
-
 def test_without_a_path_nothing_is_fetched(inner: Inner, street: DividedMap) -> None:
     """For a client that stands still or has gone, or where prefetching is switched off."""
     off = inner(street.root, prefetch_share=0.0)

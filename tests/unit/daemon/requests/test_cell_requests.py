@@ -53,16 +53,6 @@ def test_waits_that_are_refused(inner: Inner, small_map: DividedMap, warm: bool)
     assert not len(one.loads)
 
 
-def test_waits_that_are_answered_at_once(inner: Inner, small_map: DividedMap) -> None:
-    one = inner(small_map.root)
-    session = one.session()
-    for request, wait in ((1, None), (2, 0.0), (3, -0.0)):
-        one.ask(session, Area(request, EVERYWHERE, wait=wait))
-        (reply,) = [reply for _, reply in one.replies if reply.request == request]
-        assert len(reply.pending) == 16
-    assert len(one.cells_for(Area(4, EVERYWHERE, wait=3600.0), session).cells) == 16
-
-
 @pytest.mark.parametrize(
     ("area", "count"),
     [
