@@ -26,11 +26,6 @@ class ColumnSpec:
     components: int = 1
     unit: str = ""
 
-    @property
-    def row_bytes(self) -> int:
-        """Size of one row, bytes."""
-        return self.dtype.itemsize * self.components
-
 
 def column_names(names: Iterable[str]) -> tuple[str, ...]:
     """Return unique, printable names for columns beside ``xyz``, without names that PCD reserves.

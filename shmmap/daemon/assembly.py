@@ -216,7 +216,7 @@ class Service:
                 memory.statistics.beat()
                 self._publish_epoch("started")
                 self._live.begin_events()
-                memory.scheduler.start_loader()
+                memory.scheduler.pool.start_one()
                 cells, ledger = len(memory.cache.catalogue), memory.cache.ledger
                 log.info(
                     "ready",

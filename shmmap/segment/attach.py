@@ -343,10 +343,7 @@ def attach(
         This process has no more file descriptors.
     """
     try:
-        try:
-            file = _open(name, shm_dir)
-        except BlockingIOError:
-            file = _open_soon(name, shm_dir)
+        file = _open_soon(name, shm_dir)
     except (FileNotFoundError, posix_ipc.ExistentialError):
         raise StaleHandle(f"segment {name} is gone", hint="ask the daemon again") from None
     except (PermissionError, posix_ipc.PermissionsError):

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import msgspec
@@ -173,23 +173,32 @@ def header_size(column_count: int, cell_id: str, layer: str, frame_id: str) -> i
 
 def plan_columns(specs: Sequence[ColumnSpec], rows: int, header_bytes: int) -> tuple[tuple[Column, ...], int]:
     """Place one column after the other, each 64-byte aligned; return the columns and the total bytes."""
-    columns = []
-    offset = header_bytes
-    for spec in specs:
-        shape = (rows,) if spec.components == 1 else (rows, spec.components)
-        nbytes = rows * spec.row_bytes
-        columns.append(Column(spec.name, spec.dtype, shape, offset, nbytes, spec.unit))
-        offset = _up(offset + nbytes, ALIGNMENT_BYTES)
-    return tuple(columns), offset
+    return _placed(
+        (
+            (spec.name, spec.dtype, (rows,) if spec.components == 1 else (rows, spec.components), spec.unit)
+            for spec in specs
+        ),
+        header_bytes,
+    )
 
 
 def plan_arrays(
     arrays: Mapping[str, NDArray[np.generic]], units: Mapping[str, str], header_bytes: int
 ) -> tuple[tuple[Column, ...], int]:
     """Place arrays of any shapes as `plan_columns` does; return the columns and the total bytes."""
+    return _placed(
+        ((name, array.dtype, array.shape, units.get(name, "")) for name, array in arrays.items()),
+        header_bytes,
+    )
+
+
+def _placed(
+    wanted: Iterable[tuple[str, np.dtype[np.generic], tuple[int, ...], str]], offset: int
+) -> tuple[tuple[Column, ...], int]:
+    """Place columns, given by name, type, shape and unit, from an offset on."""
     columns = []
-    offset = header_bytes
-    for name, array in arrays.items():
-        columns.append(Column(name, array.dtype, array.shape, offset, array.nbytes, units.get(name, "")))
-        offset = _up(offset + array.nbytes, ALIGNMENT_BYTES)
+    for name, dtype, shape, unit in wanted:
+        nbytes = math.prod(shape) * dtype.itemsize
+        columns.append(Column(name, dtype, shape, offset, nbytes, unit))
+        offset = _up(offset + nbytes, ALIGNMENT_BYTES)
     return tuple(columns), offset

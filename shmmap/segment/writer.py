@@ -109,7 +109,7 @@ class SegmentWriter:
     def append(self, column: int, rows: NDArray[np.generic]) -> None:
         """Append a C-contiguous block of rows to column number ``column``."""
         step("worker.write")
-        data = rows.data.cast("B") if rows.size else memoryview(b"")
+        data = _bytes(rows)
         self._hashes[column].update(data)
         write_all(self._fd, data, self._at[column])
         self._at[column] += len(data)
@@ -125,7 +125,6 @@ class SegmentWriter:
         dropped_points: int,
         builder_version: int,
         outside_points: int = 0,
-        origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> SegmentHeader:
         """Write the header, which completes the segment.
 
@@ -146,7 +145,6 @@ class SegmentWriter:
             columns=tuple(columns),
             z_min=z_min,
             z_max=z_max,
-            origin=origin,
             source=source,
             source_digest=source_digest,
             source_points=source_points,

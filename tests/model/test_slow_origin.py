@@ -10,7 +10,7 @@ import pytest
 
 from shmmap.origin.catalogue import Catalogue
 from tests.benchmarks.slow_origin_drives import Drive, dense_catalogue, town_drive
-from tests.benchmarks.slow_origin_model import OUTAGES, SIGMA, Counts, Outages, SlowOrigin
+from tests.benchmarks.slow_origin_model import OUTAGES, Counts, Outages, SlowOrigin
 from tests.benchmarks.slow_origin_run import Setting, simulate
 
 
@@ -57,13 +57,6 @@ def test_what_is_compared_with() -> None:
     assert none.over_fetch < 1.02
     assert oracle.late == 0
     assert oracle.over_fetch < 1.02
-
-
-def test_load_times_have_the_mean_they_are_said_to_have() -> None:
-    origin = SlowOrigin(0.4, OUTAGES["none"], 1)
-    times = np.array([origin.took_s() for _ in range(40_000)])
-    assert times.mean() == pytest.approx(0.4, rel=0.03)
-    assert np.log(times).std() == pytest.approx(SIGMA, rel=0.03)
 
 
 def test_loads_that_meet_an_outage_fail() -> None:

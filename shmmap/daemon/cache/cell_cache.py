@@ -143,12 +143,6 @@ class CellCache:
         """Pages of the list of cells; None if the list is complete."""
         return self.catalogue.pages
 
-    def at_height(self, indices: list[int], z: tuple[float, float] | None) -> list[int]:
-        """Drop the cells whose heights, known from an earlier load, lie outside a range."""
-        if z is None:
-            return indices
-        return self.heights.overlapping(indices, z)
-
     def pages_around(self, area: Area, layers: Iterable[str]) -> Sequence[int]:
         """Return the pages that list an area's cells and the neighbouring cells that these layers read."""
         pages = self.pages
@@ -201,11 +195,6 @@ class CellCache:
         """Return the segment of a key that can be handed out, whether current or not."""
         resident = self.ledger.by_key.get(key)
         return resident if resident is not None and resident.checked else None
-
-    def is_held(self, index: int, layer: str) -> bool:
-        """Whether a session holds the current version of a cell."""
-        resident = self.warm.get(index, layer)
-        return resident is not None and bool(resident.sessions)
 
     def replaced_bytes(self, session: Session, key: Key) -> int:
         """Return the bytes of an old version that a session holds and will drop for the new one."""

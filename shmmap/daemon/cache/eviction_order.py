@@ -125,13 +125,15 @@ class Deferred:
         return self._until_s.pop(resident, None) is not None
 
     def first(self) -> tuple[float, Resident] | None:
-        """Return the time when the first deferral ends, and its segment."""
-        while self._heap:
-            until_s, _, resident = self._heap[0]
-            if self._until_s.get(resident) == until_s:
-                return until_s, resident
+        """Return when the first deferral ends at the earliest, and its segment, which may have been removed.
+
+        Removed segments are dropped here, a bounded number per call: very many may have been removed.
+        """
+        for _ in range(BATCH):
+            if not self._heap or self._until_s.get(self._heap[0][2]) == self._heap[0][0]:
+                break
             heapq.heappop(self._heap)
-        return None
+        return (self._heap[0][0], self._heap[0][2]) if self._heap else None
 
     def due(self, now_s: float) -> list[Resident]:
         """Remove and return segments whose deferral has ended, a bounded number."""
@@ -147,7 +149,7 @@ class Deferred:
 
     def take_all(self) -> ShardedDict[Resident, float | None]:
         """Remove and return all segments."""
-        found, self._until_s = self._until_s, ShardedDict()
+        found, self._until_s, self._heap = self._until_s, ShardedDict(), []
         return found
 
 
@@ -236,11 +238,6 @@ class EvictionOrder:
         self._tries = 0
         self._tried.clear()
         return [entry.resident for entry in front]
-
-    @property
-    def all_scored(self) -> bool:
-        """Whether all segments have been scored."""
-        return not self.new
 
     def fill(self, score: Score, now_s: float) -> bool:
         """Score some new or no longer deferred segments if few are in order; return whether any were."""

@@ -183,6 +183,8 @@ class Evictor:
             if soon is None:
                 return False
             until_s, resident = soon
+            if resident not in order.in_grace:
+                continue
             if ledger.is_needed(resident.key):
                 order.defer(resident, order.deferred, math.inf)
             elif not self._found_in_use(resident, now_s):

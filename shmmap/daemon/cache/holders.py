@@ -204,7 +204,7 @@ class Survey:
         self._rests_until_s = now_s + took_s / SHARE if took_s > LONG_STEP_S else 0.0
 
     def look_at(
-        self, session: Session, before_s: float, enough: Callable[[], bool], wanted: Container[Key] = ()
+        self, session: Session, before_s: float, enough: Callable[[], bool], wanted: Container[Key]
     ) -> Generator[None, None, None]:
         """Drop segments that a session no longer maps, checking one per step, until ``enough()`` is True.
 

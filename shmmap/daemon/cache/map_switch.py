@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterator, Sequence
-from typing import Any, Final
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -20,9 +20,16 @@ from shmmap.segment.version import Stamp
 
 __all__ = ["MapSwitch"]
 
-STATES_REMEMBERED: Final = 64
 CELLS_REMEMBERED: Final = 2048
 """Changed cells remembered, over all states; for changes before these, clients read the whole list."""
+
+
+class _Changed(NamedTuple):
+    """A cell that changed, appeared or vanished; the first one of each change names the state before it."""
+
+    map_version: int | None
+    cell: str
+    has_vanished: bool
 
 
 class MapSwitch:
@@ -34,8 +41,7 @@ class MapSwitch:
 
     def __init__(self, cache: CellCache) -> None:
         self._cache = cache
-        self._history: deque[tuple[int, frozenset[str], tuple[str, ...]]] = deque(maxlen=STATES_REMEMBERED)
-        self._remembered = 0
+        self._history: deque[_Changed] = deque(maxlen=CELLS_REMEMBERED)
         self._unseen: Walk[Resident] | None = None
         self._leftovers: list[ShardedDict[int, Any]] = []
         self._to_free: Walk[None] | None = None
@@ -45,18 +51,12 @@ class MapSwitch:
         if map_version == self._cache.catalogue.map_version:
             return set(), []
         history = list(self._history)
-        starts = [number for number, entry in enumerate(history) if entry[0] == map_version]
+        starts = [number for number, entry in enumerate(history) if entry.map_version == map_version]
         if not starts:
             return None
-        changed: set[str] = set()
-        removed: dict[str, None] = {}
-        for _version, touched, vanished in history[starts[-1] :]:
-            changed |= touched
-            changed -= set(vanished)
-            removed.update(dict.fromkeys(vanished))
-            for cell in touched:
-                removed.pop(cell, None)
-        return changed, list(removed)
+        vanished = {entry.cell: entry.has_vanished for entry in history[starts[-1] :]}  # the last one counts
+        removed = [cell for cell in vanished if vanished[cell]]
+        return vanished.keys() - removed, removed
 
     def catch_up(self, cells: Sequence[int], reads: Sequence[Stamp], known: Sequence[Stamp]) -> bool:
         """Record the states of files that a loader has read; return False if the map may have newer ones.
@@ -95,11 +95,9 @@ class MapSwitch:
         cache = self._cache
         if change.known and change.count <= CELLS_REMEMBERED:
             touched = {cell for how in ("changed", "added", "moved") for cell in change.ids(how)}
-            if change:
-                self._remember(touched, change.ids("removed"))
+            self._remember(touched, change.ids("removed"))
         else:
             self._history.clear()
-            self._remembered = 0
         changed = np.concatenate((change.changed, change.moved))
         cache.statistics.map_changed()
         self._leftovers += cache.serve(new, changed if change.same_cells else None)
@@ -158,15 +156,10 @@ class MapSwitch:
         elif not cache.is_current(resident) and cache.layers.version(index, resident.key.layer):
             cache.reclaimer.retire(resident, now_s, "map")
 
-    def _remember(self, changed: set[str], removed: tuple[str, ...]) -> None:
-        history = self._history
-        if len(history) == STATES_REMEMBERED:
-            self._forget_oldest()
-        history.append((self._cache.catalogue.map_version, frozenset(changed), removed))
-        self._remembered += len(changed) + len(removed)
-        while self._remembered > CELLS_REMEMBERED:
-            self._forget_oldest()
-
-    def _forget_oldest(self) -> None:
-        _version, changed, removed = self._history.popleft()
-        self._remembered -= len(changed) + len(removed)
+    def _remember(self, changed: Iterable[str], removed: Iterable[str]) -> None:
+        """Remember the next change of the served state; the oldest ones are forgotten."""
+        version: int | None = self._cache.catalogue.map_version
+        for cells, vanish in ((changed, False), (removed, True)):
+            for cell in cells:
+                self._history.append(_Changed(version, cell, vanish))
+                version = None

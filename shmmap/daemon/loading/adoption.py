@@ -79,10 +79,14 @@ class Adoption:
         self._judge(list(self._deferred), now_s)
 
     def _judge(self, names: Iterable[str], now_s: float) -> None:
+        """Decide about deferred segments; each waits on while a page of its area is missing."""
         ledger = self.cache.ledger
         for name in names:
             area, nbytes = self._deferred[name]
-            if not self._wait_for_page(name, area):
+            page = self._absent_page(area)
+            if page is not None:
+                self._by_page.setdefault(page, []).append(name)
+            else:
                 del self._deferred[name]
                 ledger.set_aside_bytes -= nbytes
                 self._take(name, now_s)
@@ -100,13 +104,6 @@ class Adoption:
             return None
         return next((page for page in pages.of_area(area) if not pages.is_here(page)), None)
 
-    def _wait_for_page(self, name: str, area: Box) -> bool:
-        """Let a segment wait for one missing page of its area; return False if none is missing."""
-        page = self._absent_page(area)
-        if page is not None:
-            self._by_page.setdefault(page, []).append(name)
-        return page is not None
-
     def _may_become_known(self, resident: Resident) -> Box | None:
         """Return the area by which a segment is judged if pages of it are missing; else None."""
         catalogue, layers = self.cache.catalogue, self.cache.layers
@@ -117,11 +114,10 @@ class Adoption:
         area = Box(min_x - halo_m, min_y - halo_m, max_x + halo_m, max_y + halo_m)
         return area if self._absent_page(area) is not None else None
 
-    def _defer(self, name: str, area: Box, nbytes: int) -> None:
-        ledger = self.cache.ledger
+    def _defer(self, name: str, area: Box, nbytes: int, now_s: float) -> None:
         self._deferred[name] = area, nbytes
-        ledger.set_aside_bytes += nbytes
-        self._wait_for_page(name, area)
+        self.cache.ledger.set_aside_bytes += nbytes
+        self._judge((name,), now_s)
         pages = self.cache.pages
         if pages is not None:
             pages.want(pages.of_area(area), ADOPTED)
@@ -140,7 +136,7 @@ class Adoption:
                 self._adopt(fd, resident, outside)
                 return "taken_over"
             if why_not in UNDECIDED and (area := self._may_become_known(resident)) is not None:
-                self._defer(name, area, resident.nbytes)
+                self._defer(name, area, resident.nbytes, now_s)
                 return "set_aside"
             if self._is_used(fd):
                 reclaimer = self.cache.reclaimer

@@ -223,7 +223,7 @@ class Loads:
         self._queue.push(load, priority, asker)
         return load
 
-    def prefetch(self, key: Key, estimate: int, needed_in_s: float, *, computed: bool | None = None) -> Load:
+    def prefetch(self, key: Key, estimate: int, needed_in_s: float, *, computed: bool) -> Load:
         """Queue a load that no client has asked for yet, after all loads that clients ask for."""
         load = self.want(key, estimate, PREFETCH + needed_in_s, PREFETCH, computed=computed)
         load.wanted, load.prefetch = False, True
@@ -241,11 +241,7 @@ class Loads:
 
     def next_queued(self, *, points: bool = True, layers: bool = True) -> Load | None:
         """Return the nearest load of the asker whose turn it is, of the kinds that a worker can take now."""
-        while (load := self._queue.next(points=points, layers=layers)) is not None:
-            if self.by_key.get(load.key) is load and not load.running:
-                return load
-            self._queue.discard(load)  # cancelled in the meantime
-        return None
+        return self._queue.next(points=points, layers=layers)
 
     def bytes_behind(self) -> int:
         """Return the bytes of some loads that follow the one `next_queued` has just returned."""

@@ -113,7 +113,7 @@ LONG_STRAIGHT_M: Final = 500.0
 """Length of a straight, longer than most streets of a town, beyond which each metre that a client has moved
 straight ahead extends the look-ahead by a metre."""
 BESIDE_M: Final = 2.0
-"""Allowed lateral distance of a client from its route, which is the middle of a lane."""
+"""Allowed lateral distance of a client from its route, which is the middle of a lane: the area is wider."""
 
 
 class LookAhead(NamedTuple):
@@ -237,16 +237,12 @@ class ClientPath:
         route = self.motion.route
         return 0.0 if route is None else route.length_m - self.motion.along_m
 
-    @property
-    def _wider_m(self) -> float:
-        """Margin added to the area, metres: clients do not drive in the exact middle of a lane."""
-        return BESIDE_M if self.motion.route is not None else 0.0
-
     def _around(self, catalogue: CatalogueView, ahead_m: float, sides: bool) -> NDArray[np.intp]:
         """Return cells that the client may need after this distance; with ``sides`` also beside the path."""
         motion, left_m = self.motion, self._left_m
-        x, y, heading = motion.x, motion.y, math.atan2(motion.vy, motion.vx)
+        x, y, heading, wider_m = motion.x, motion.y, math.atan2(motion.vy, motion.vx), 0.0
         if motion.route is not None:
+            wider_m = BESIDE_M
             x, y = motion.route.at(motion.along_m + ahead_m).tolist()
             heading = motion.route.last_heading
         beyond_m = max(ahead_m - left_m, 0.0)
@@ -255,7 +251,7 @@ class ClientPath:
             side_m = max(0.0, beyond_m - LATER_S / self.pace_s)
             rays += [(heading + SPREAD_RAD, side_m), (heading - SPREAD_RAD, side_m)]
         areas = [
-            self.area.around(x + far_m * math.cos(angle), y + far_m * math.sin(angle), self._wider_m)
+            self.area.around(x + far_m * math.cos(angle), y + far_m * math.sin(angle), wider_m)
             for angle, far_m in rays
         ]
         found = [self._known(catalogue, area, ahead_m * self.pace_s) for area in areas]
@@ -393,7 +389,9 @@ class Prefetch:
             if not self._uncompared:
                 return True
             path = self._uncompared[-1]
-            self._begin_if_due(path, now_s)
+            due = now_s - path.began_s >= PASS_S and (path.is_done or path.first() is not None)
+            if path.moves and (due or path.has_jumped):
+                path.begin(now_s)
             if (first := path.first()) is not None:
                 needed_in_s, index = first
                 absent = [layer for layer in path.layers if self._is_absent(index, layer)]
@@ -422,12 +420,6 @@ class Prefetch:
         if away_s > SLACK_S:  # a single lost answer does not show how long outages are
             self._away_s = max(away_s, 0.5 * self._away_s)
         return True
-
-    def _begin_if_due(self, path: ClientPath, now_s: float) -> None:
-        """Begin another pass over a path, if one is due."""
-        due = now_s - path.began_s >= PASS_S and (path.is_done or path.first() is not None)
-        if path.moves and (due or path.has_jumped):
-            path.begin(now_s)
 
     def next_s(self, now_s: float) -> float:
         """Return when to ask again if nothing happens until then."""

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -11,7 +11,7 @@ from shmmap.daemon.host.memory import memory_limit_bytes, out_of_memory_kills
 from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.loading.prepared_parent import RESTART
 from shmmap.daemon.loading.room import Room
-from shmmap.daemon.loading.worker_pool import Worker, WorkerPool
+from shmmap.daemon.loading.worker_pool import Work, Worker, WorkerPool
 from shmmap.daemon.records import Load
 from shmmap.logfmt import log
 from shmmap.quantities import format_bytes
@@ -86,21 +86,16 @@ class LostWorkers:
         how = how or self.pool.parent.why_not or "its parent has ended"
         log.error("loader could not start", reason=how)
         give_up = how == RESTART or self.pool.failed_starts >= START_ATTEMPTS
-        for job in self.pool.remove(worker):
-            load = self.jobs.pop(job.number, None)
-            if load is not None and give_up:
+        for job, load in self._unfinished(worker):
+            if give_up:
                 self.fail(load, "load_failed", f"{job.source.name}: no loader can start: {how}", None, now_s)
-            elif load is not None:
+            else:
                 self.loads.requeue(load)
 
     def _vanished(self, worker: Worker, now_s: float) -> None:
         """Replace a worker whose parent ended: no job is blamed, unless this happens repeatedly."""
         at_work = worker.at_work or next(iter(worker.queue), 0)
-        for job in self.pool.remove(worker):
-            self.room.forget(job.number)
-            load = self.jobs.pop(job.number, None)
-            if load is None:
-                continue
+        for job, load in self._unfinished(worker):
             load.losses += job.number == at_work
             if load.losses < LOSSES_ALLOWED:
                 self.loads.requeue(load)
@@ -114,16 +109,21 @@ class LostWorkers:
             log.error("loader replaced", reason=why)
             self._vanished(worker, now_s)
             return
+        for job, load in self._unfinished(worker):
+            if job.number != at_work:
+                self.loads.requeue(load)
+                continue
+            log.error("loader replaced", path=job.source.name, reason=why)
+            load.spent_s = spent_s
+            # after a timeout the file is not accessed again: its file system may be what hangs
+            blamed = code == "load_failed" and not why.startswith(OUT_OF_MEMORY)
+            known = load.sources[0] if blamed and load.sources else None
+            self.fail(load, code, f"{job.source.name}: {why}", known, now_s)
+
+    def _unfinished(self, worker: Worker) -> Iterator[tuple[Work, Load]]:
+        """Remove a worker; yield its unfinished jobs and their loads."""
         for job in self.pool.remove(worker):
             self.room.forget(job.number)
             load = self.jobs.pop(job.number, None)
-            if job.number == at_work:
-                log.error("loader replaced", path=job.source.name, reason=why)
-                if load is not None:
-                    load.spent_s = spent_s
-                    # after a timeout the file is not accessed again: its file system may be what hangs
-                    blamed = code == "load_failed" and not why.startswith(OUT_OF_MEMORY)
-                    known = load.sources[0] if blamed and load.sources else None
-                    self.fail(load, code, f"{job.source.name}: {why}", known, now_s)
-            elif load is not None:
-                self.loads.requeue(load)
+            if load is not None:  # else another loader has reported the end of this job
+                yield job, load

@@ -84,7 +84,6 @@ class ObjectFetcher:
         )  # the loader exits without waiting for these threads
         self.fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK | os.EFD_SEMAPHORE)
         self._fetches: dict[bytes, _Fetch] = {}
-        self._lacking: dict[int, set[bytes]] = {}
         self._needs: dict[int, tuple[bytes, ...]] = {}
         self._queue: deque[_Fetch] = deque()
         self._done: deque[int] = deque()
@@ -98,17 +97,13 @@ class ObjectFetcher:
         with self._lock:
             self._forget_last()
             self._needs[number] = tuple(names)
-            lacking = self._lacking[number] = set()
             for digest, name in names.items():
                 fetch = self._fetches.get(digest)
                 if fetch is None:
                     fetch = self._fetches[digest] = _Fetch(name)
                     self._queue.append(fetch)
                 fetch.jobs.add(number)
-                if fetch.frame is None:
-                    lacking.add(digest)
-            if not lacking:
-                self._finish(number)
+            self._finish_if_complete(number)
             self._begin_some()
 
     def done(self) -> int | None:
@@ -162,10 +157,10 @@ class ObjectFetcher:
         self._at_work = 0
         self._begin_some()
 
-    def _finish(self, number: int) -> None:
-        del self._lacking[number]
-        self._done.append(number)
-        os.eventfd_write(self.fd, 1)
+    def _finish_if_complete(self, number: int) -> None:
+        if all(self._fetches[digest].frame is not None for digest in self._needs[number]):
+            self._done.append(number)
+            os.eventfd_write(self.fd, 1)
 
     def _begin_some(self) -> None:
         while self._queue and self._under_way < CONCURRENT_FETCHES:
@@ -182,11 +177,7 @@ class ObjectFetcher:
     def _fetch_ended(self, fetch: _Fetch, frame: memoryview | ShmmapError) -> None:
         fetch.frame = frame
         for number in fetch.jobs:
-            lacking = self._lacking.get(number)
-            if lacking is not None:
-                lacking.discard(fetch.name.sha256)
-                if not lacking:
-                    self._finish(number)
+            self._finish_if_complete(number)
 
 
 def _needed(spec: LayerSpec, job: CellJob) -> Iterator[ObjectName]:

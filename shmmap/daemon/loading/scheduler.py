@@ -148,10 +148,6 @@ class Scheduler:
         self.misplaced = MisplacedCells(cache)
         self.lost = LostWorkers(pool, self._jobs, self.loads, self.room, cache.statistics, self._fail)
 
-    def start_loader(self) -> None:
-        """Start a loader before the first load."""
-        self.pool.start_one()
-
     # --- requests -------------------------------------------------------------------------------
 
     def want(
@@ -319,13 +315,12 @@ class Scheduler:
             catalogue.frame_id,
             load.estimate,
             points=points.name if points is not None else "",
-            neighbours=tuple(map(self._neighbour, around)),
+            neighbours=tuple(
+                Neighbour.of(catalogue.id(near), catalogue.source(near), catalogue.box(near))
+                for near in around
+            ),
             ready=ready.version if ready is not None else 0,
         )
-
-    def _neighbour(self, index: int) -> Neighbour:
-        catalogue = self._cache.catalogue
-        return Neighbour.of(catalogue.id(index), catalogue.source(index), catalogue.box(index))
 
     def next_event_s(self) -> float:
         """Return when there is something to do if nothing arrives; infinity for never."""

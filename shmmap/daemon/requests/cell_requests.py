@@ -236,7 +236,8 @@ class CellRequests:
             found.reason = "offline" if len(found.pages) < len(absent) else ""
             pages.want(needed, 0.0)
         yield from wanted.pause(now=len(indices) > LARGE)
-        return self._cache.at_height(indices.tolist(), area.z)
+        known: list[int] = indices.tolist()
+        return known if area.z is None else self._cache.heights.overlapping(known, area.z)
 
     def release(self, residents: Iterable[Resident]) -> None:
         """Release segments that a client has dropped."""
@@ -390,7 +391,7 @@ class CellRequests:
         """
         cache, warm, found, now_s = self._cache, self._cache.warm.layers, wanted.found, self._now_s()
         if wanted.area is not None and wanted.area.z is not None:
-            inside = set(cache.at_height([index for index, _ in found.cells], wanted.area.z))
+            inside = set(cache.heights.overlapping([index for index, _ in found.cells], wanted.area.z))
             found.cells = [cell for cell in found.cells if cell[0] in inside]
         answer = _Answer()
         yield from wanted.pause(now=wanted.is_large)
@@ -448,9 +449,8 @@ class CellRequests:
             answer.handles.append(resident.handle if current else resident.stale_handle)
         if refused:
             mine = wanted.session.as_holder(wanted.session.held_bytes, len(wanted.session.held))
-            box, holders = catalogue.box(index), (mine,) if mine.bytes else ()
-            message = self._quota.message
-            answer.failed.append(FailedCell(wire_id, layer, "over_budget", message, holders, box))
+            holders, box = (mine,) if mine.bytes else (), catalogue.box(index)
+            answer.failed.append(FailedCell(wire_id, layer, "over_budget", self._quota.message, holders, box))
         elif not current and failure is not None and not promised:
             holders = _UNNAMED if failure.code in SPACE_CODES else ()
             box = catalogue.box(index)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
 from collections.abc import Callable
@@ -15,7 +16,7 @@ from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.daemon.requests.operators.operator_requests import OperatorRequests
 from shmmap.daemon.transport.connection import Connection
 from shmmap.daemon.transport.sessions import Session, Sessions
-from shmmap.errors import BadRequest, ProtocolMismatch
+from shmmap.errors import BadRequest, Busy, ProtocolMismatch
 from shmmap.logfmt import log
 from shmmap.protocol import events
 from shmmap.protocol.messages import PROTOCOL_VERSION, Hello
@@ -94,7 +95,8 @@ class Handshake:
         self.cells.on_disconnect(session)
         self.sessions.departed[session.slot] = session
         if session.held:
-            self.survey.ask(session, lambda usage: self._leave_if_unused(session, usage))
+            with contextlib.suppress(Busy):  # it waits for many results: `look_after_departed` ends it later
+                self.survey.ask(session, lambda usage: self._leave_if_unused(session, usage))
         else:
             self.leave(session)
 

@@ -205,7 +205,8 @@ class SessionQuota:
                 if key in counted:
                     continue
                 counted.add(key)
-                if self.cache.is_held(index, layer):
+                resident = self.cache.warm.get(index, layer)
+                if resident is not None and resident.sessions:
                     continue  # a session holds it already, perhaps this one
                 added += sizes[position] - self.cache.replaced_bytes(session, key)
                 if session.exclusive_bytes + added > self.nbytes:

@@ -235,15 +235,13 @@ class MapQueries:
             end = min(start + limit, count)
             return range(start, end), end if end < count else None
         found, _ = catalogue.query(area, LOOKED_AT)
-        if len(found) <= LOOKED_AT:
-            found = found[found.searchsorted(start) :]
-            more = len(found) > limit
-            return found[:limit].tolist(), int(found[limit]) if more else None
-        end = min(start + LOOKED_AT, count)
-        found = np.flatnonzero(touches(area, catalogue.boxes_of(np.arange(start, end)))) + start
-        if len(found) > limit:
-            return found[:limit].tolist(), int(found[limit])
-        return found.tolist(), end if end < count else None
+        end = count
+        if len(found) > LOOKED_AT:
+            end = min(start + LOOKED_AT, count)
+            found = np.flatnonzero(touches(area, catalogue.boxes_of(np.arange(start, end)))) + start
+        found = found[found.searchsorted(start) :]
+        following = int(found[limit]) if len(found) > limit else end
+        return found[:limit].tolist(), following if following < count else None
 
     def _rows_of_pages(
         self, pages: Pages, area: Area | None, start: int, limit: int

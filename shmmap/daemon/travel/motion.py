@@ -55,13 +55,11 @@ class Route:
     """
 
     def __init__(self, vertices: Sequence[tuple[float, float]]) -> None:
-        self._at = np.array(vertices, dtype=np.float64).reshape(-1, 2).clip(-FARTHEST_M, FARTHEST_M)
-        self._along = _along(self._at)
+        at = np.array(vertices, dtype=np.float64).reshape(-1, 2).clip(-FARTHEST_M, FARTHEST_M)
+        if len(at) > MAX_VERTICES:
+            at = at[_significant(at, _along(at))]
+        self._at, self._along = at, _along(at)
         self.length_m = float(self._along[-1])
-        if len(self._at) > MAX_VERTICES:
-            self._at = self._at[_significant(self._at, self._along)]
-            self._along = _along(self._at)
-            self.length_m = float(self._along[-1])
         steps, lengths = np.diff(self._at, axis=0), np.diff(self._along)
         moved = np.flatnonzero(lengths)
         last = steps[moved[-1]] if len(moved) else np.zeros(2)
@@ -99,16 +97,11 @@ class Route:
         nearest = float(away.min())
         if nearest > OFF_ROUTE_M:
             return None
-        return self._first_near(away, along, nearest)
-
-    @staticmethod
-    def _first_near(away: NDArray[np.float64], along: NDArray[np.float64], nearest: float) -> float:
-        """Return the nearest point of the first stretch whose distance is about the minimum."""
-        first = int(np.argmax(away <= nearest + SLACK_M))
-        last = first
-        while last + 1 < len(away) and away[last + 1] <= nearest + SLACK_M:
-            last += 1
-        return float(along[first + int(np.argmin(away[first : last + 1]))])
+        # the nearest point of the first stretch whose distance is about the minimum
+        far = np.append(away > nearest + SLACK_M, True)
+        first = int(far.argmin())
+        end = first + int(far[first:].argmax())
+        return float(along[first + int(away[first:end].argmin())])
 
 
 @dataclass(eq=False, slots=True)

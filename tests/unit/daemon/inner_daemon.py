@@ -190,10 +190,14 @@ class InnerDaemon:
         assert isinstance(reply, Cells)
         return reply
 
+    def cells_for(self, message: Area | Differential | Selected, session: Session | None = None) -> Cells:
+        """Serve a request of a session, by default a new one, until it is answered; return the cells."""
+        self.ask(session or self.session(), message)
+        return self.cells_of(message.request)
+
     def everything(self, request: int = 1) -> Cells:
         """Ask for all cells and wait for them."""
-        self.ask(self.session(), Area(request, EVERYWHERE, wait=600.0))
-        return self.cells_of(request)
+        return self.cells_for(Area(request, EVERYWHERE, wait=600.0))
 
     def path_of(self, segment: str) -> str:
         """Path of a segment that a reply names."""

@@ -25,7 +25,6 @@ from shmmap.segment.header import PublishBlock
 from shmmap.segment.pins import prepare_process
 from tests.support.process_costs import mappings_under
 from tests.support.segment_reader import read_segment
-from tests.support.segments import write_segment
 from tests.unit.segment.conftest import Publish
 
 
@@ -91,33 +90,6 @@ def test_no_descriptor_is_kept(shm: ShmDirectory, publish: Publish) -> None:
     held = [attach(name, shm_dir=shm.path, slot=i) for i in range(50)]
     assert os.listdir("/proc/self/fd") == before
     held.clear()
-
-
-def test_three_thousand_with_few_descriptors(shm: ShmDirectory, publish: Publish) -> None:
-    name = publish()
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (256, hard))
-    try:
-        held = [attach(name, shm_dir=shm.path, slot=i) for i in range(3000)]
-        assert mappings_under(name) > 0
-        assert float(held[0].column(0).sum()) == float(held[-1].column(0).sum())
-    finally:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-
-
-def test_many_small_layers_may_share_one_object(shm: ShmDirectory) -> None:
-    rng = np.random.default_rng(1)
-    xyz, intensity = rng.random((10, 3)), np.arange(10, dtype="<u2")
-    with open(f"{shm.path}/one", "w+b") as file:
-        write_segment(file.fileno(), {"xyz": xyz, "intensity": intensity})
-        one = Path(file.name).read_bytes()
-    one += bytes(-len(one) % 4096)
-    Path(shm.path, "slab").write_bytes(bytes(8192) + one)
-    segment = attach("/slab", shm_dir=shm.path, offset=8192, nbytes=len(one))
-    assert np.array_equal(segment.column(0), xyz)
-    assert np.array_equal(segment.column(1), intensity)
-    for name in ("one", "slab"):
-        os.unlink(f"{shm.path}/{name}")
 
 
 def test_gone(shm: ShmDirectory) -> None:

@@ -12,7 +12,6 @@ import struct
 import subprocess
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -24,7 +23,6 @@ from shmmap.segment.attach import AttachedSegment, attach
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.header import PublishBlock
 from shmmap.segment.pins import MAX_SLOT, holders, in_use, lock_slot, prepare_process
-from tests.support.mapping_process import MappingProcess
 from tests.support.segments import publish_segment
 from tests.unit.segment.conftest import Publish
 
@@ -64,17 +62,6 @@ def test_an_open_file_and_a_mapping_are_uses(shm: ShmDirectory, publish: Publish
     assert pinned(shm, name)
     mapped.close()
     assert not pinned(shm, name)
-
-
-def test_a_pin_follows_a_rename_and_outlives_a_stop(shm: ShmDirectory, publish: Publish) -> None:
-    name = publish()
-    with MappingProcess([f"{shm.path}{name}"]) as reader:
-        os.kill(reader.pid, signal.SIGSTOP)
-        assert pinned(shm, name)
-        assert shm.rename(name, name + ".zombie")
-        assert pinned(shm, name + ".zombie")
-        os.kill(reader.pid, signal.SIGCONT)
-    assert not pinned(shm, name + ".zombie")
 
 
 _READER: Final = """
@@ -146,20 +133,6 @@ def test_slots_of_holders(shm: ShmDirectory, publish: Publish) -> None:
     assert not pinned(shm, name)
 
 
-def test_many_holders_are_counted_up_to_a_limit(shm: ShmDirectory, publish: Publish) -> None:
-    name = publish()
-    rng = random.Random(3)
-    slots = sorted(rng.sample(range(MAX_SLOT), 300))
-    held = [attach(name, shm_dir=shm.path, slot=slot) for slot in slots]
-    assert slots_of(shm, name) == slots
-    fd = shm.open(name)
-    some = holders(fd, limit=10)
-    os.close(fd)
-    assert len(some) == 10
-    assert set(some) <= set(slots)
-    held.clear()
-
-
 def test_locks_over_ranges_count_as_no_holder_and_hide_none(shm: ShmDirectory, publish: Publish) -> None:
     name = publish()
     other_fd = shm.open(name)
@@ -199,17 +172,6 @@ def test_random_steps_against_a_model(shm: ShmDirectory, publish: Publish) -> No
             current = name + zombie[name]
         assert pinned(shm, current) == bool(held[name])
         assert slots_of(shm, current) == sorted({slot for slot, _ in held[name] if slot is not None})
-
-
-def test_nothing_of_it_needs_the_name(shm: ShmDirectory, publish: Publish) -> None:
-    name = publish()
-    keeper = shm.open(name)
-    with MappingProcess([f"{shm.path}{name}"]):
-        assert shm.unlink(name)
-        assert in_use(keeper)
-    assert not in_use(keeper)
-    os.close(keeper)
-    assert not Path(f"{shm.path}{name}").exists()
 
 
 def test_asking_for_holders_without_number_ends(

@@ -68,7 +68,7 @@ def test_bytes_of_the_columns(segment: tuple[int, SegmentHeader]) -> None:
     verify_file(fd)
 
 
-@pytest.mark.parametrize("nbytes", [0, 1, 100, 4095, 4096, 100_000])
+@pytest.mark.parametrize("nbytes", [0, 1, 100, 215, 216, 4095, 4096, 100_000])
 def test_a_shorter_file(segment: tuple[int, SegmentHeader], nbytes: int) -> None:
     fd, _header = segment
     os.ftruncate(fd, nbytes)

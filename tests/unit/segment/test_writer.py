@@ -91,28 +91,6 @@ def test_until_it_is_finished_it_is_no_segment() -> None:
         assert os.pread(file.fileno(), 4096, 0) == bytes(4096)
 
 
-@pytest.mark.root
-def test_a_full_file_system_is_an_error(tmp_path: Path) -> None:
-    import subprocess
-
-    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", tmp_path]).returncode:
-        pytest.skip("cannot mount a tmpfs")
-    try:
-        writer = SegmentWriter(
-            [ColumnSpec("xyz", np.dtype("<f4"), 3)],
-            200_000,
-            cell_id="a",
-            layer="points",
-            box=(0.0, 0.0, 1.0, 1.0),
-        )
-        with tempfile.TemporaryFile(dir=tmp_path) as file:
-            writer.start(file.fileno())
-            with pytest.raises(OSError, match="No space"):
-                writer.append(0, np.ones((200_000, 3), "<f4"))
-    finally:
-        subprocess.run(["umount", tmp_path], check=True)
-
-
 @pytest.mark.parametrize("rows", [0, 1, 5, 341, 342, 100_003])
 def test_every_page_is_allocated(rows: int) -> None:
     writer = SegmentWriter(

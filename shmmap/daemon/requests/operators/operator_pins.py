@@ -67,7 +67,6 @@ class OperatorPins:
     cache: CellCache
     scheduler: Scheduler
     _keys: OrderedDict[Key, int] = field(default_factory=OrderedDict)  # with their bytes, as last known
-    _total: int = 0
 
     def __contains__(self, key: Key) -> bool:
         return key in self._keys
@@ -96,7 +95,7 @@ class OperatorPins:
             yield from pace.pause()
             if key not in self._keys:
                 new[key] = self._size(key)
-        total = self._total + sum(new.values())
+        total = sum(self._keys.values()) + sum(new.values())
         if not ledger.fits_at_all(total):
             raise OverBudget(
                 f"with these cells {format_bytes(total)} would be pinned; the budget is"
@@ -110,7 +109,6 @@ class OperatorPins:
             if key not in self._keys:
                 ledger.need(key)
                 self._keys[key] = new[key]
-                self._total += new[key]
             self._keep(key, now_s)
         return (yield from self._answer(message.request, wanted, unknown))
 
@@ -119,7 +117,7 @@ class OperatorPins:
         cells, unknown = yield from cells_named(self.cache, message.ids or ())
         named, ledger = set(cells), self.cache.ledger
         for key in [key for key in self._keys if message.ids is None or key.cell_id in named]:
-            self._total -= self._keys.pop(key)
+            del self._keys[key]
             ledger.need_no_more(key)
         return (yield from self._answer(message.request, list(self._keys), unknown))
 
@@ -130,9 +128,7 @@ class OperatorPins:
             self._keep(key, now_s)
 
     def _keep(self, key: Key, now_s: float) -> None:
-        size = self._size(key)
-        self._total += size - self._keys[key]
-        self._keys[key] = size
+        self._keys[key] = self._size(key)
         index = self.cache.index_of(key.cell_id)
         if index is not None and self.cache.find_warm(index, key.layer, now_s) is None:
             self.scheduler.want(index, key.layer, BACKGROUND, now_s)

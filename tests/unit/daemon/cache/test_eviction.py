@@ -13,11 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from shmmap.daemon.cache.eviction_order import BATCH, FRONT, TRIES, EvictionOrder, Score
+from shmmap.daemon.cache.eviction_order import BATCH, FRONT, TRIES, Deferred, EvictionOrder, Score
 from shmmap.daemon.cache.evictor import SOON_S, eviction_scores
 from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.travel.motion import Motion
-from shmmap.daemon.travel.places import NOWHERE, Places, merged_places, places_of, until_needed
+from shmmap.daemon.travel.places import Places, merged_places, places_of, until_needed
 from shmmap.protocol.messages import Intent
 
 coordinates = st.floats(-1e5, 1e5)
@@ -59,12 +59,6 @@ def ordered(some: list[Resident], *clients: Places) -> list[Resident]:
     return sorted(some, key=ranks.__getitem__)
 
 
-@given(residents())
-def test_without_any_client_the_least_recently_used(candidates: list[Resident]) -> None:
-    times = [resident.last_use_s for resident in ordered(candidates)]
-    assert times == sorted(times)
-
-
 @given(residents(), st.lists(points, min_size=1, max_size=4), st.floats(0, 100))
 def test_needed_last(candidates: list[Resident], places: list[tuple[float, float]], now_s: float) -> None:
     """The time until any client comes to it counts, weighted by size."""
@@ -96,11 +90,6 @@ def test_examples() -> None:
     far_used.last_use_s = 2.0
     assert ordered([near_unused, far_used], here) == [far_used, near_unused]
     assert ordered([far_used, near_unused]) == [near_unused, far_used]
-
-
-def test_nothing_to_score() -> None:
-    for places in (NOWHERE, client(0.0, 0.0)):
-        assert eviction_scores([], places, 0.0).shape == (0,)
 
 
 def numbered(number: int, last_use_s: float = 0.0) -> Resident:
@@ -230,7 +219,7 @@ def test_all_of_many_in_order(count: int) -> None:
     for one in some:
         worth.of_number[one.version] = random.random() * 100
         order.new[one] = None
-    while not order.all_scored:
+    while order.new:
         order.score_new(worth.score)
     for one in random.sample(some, count // 3):
         one.last_use_s += 1.0
@@ -247,7 +236,7 @@ def settled(count: int, worth: Worth) -> tuple[EvictionOrder, list[Resident]]:
     for one in some:
         worth.of_number[one.version] = float(one.version)
         order.new[one] = None
-    while not order.all_scored:
+    while order.new:
         order.score_new(worth.score)
     return order, some
 
@@ -302,3 +291,14 @@ def test_few_come_back_at_a_time() -> None:
     assert order.scored - before == FRONT, "there are enough"
     order.score_new(worth.score)
     assert order.scored - before == FRONT + BATCH
+
+
+def test_very_many_that_are_released_at_once_are_forgotten_a_few_at_a_time() -> None:
+    """As when a client that has mapped them leaves."""
+    deferred, some = Deferred(), [numbered(number) for number in range(4 * BATCH)]
+    for one in some:
+        deferred.put(one, float(one.version))
+    for one in some[:-1]:
+        deferred.take(one)
+    assert deferred.first() == (BATCH, some[BATCH])
+    assert [deferred.first() for _ in range(3)][-1] == (4 * BATCH - 1, some[-1])

@@ -177,6 +177,25 @@ def test_what_a_client_releases_is_looked_at_a_few_at_a_time(memory: Memory) -> 
     assert not memory.ledger.retired
 
 
+def test_outdated_checks_are_dropped_some_at_a_time(memory: Memory) -> None:
+    """A segment is checked more often than it is released: here each is rescheduled many times."""
+    (one,) = memory.publish(1)
+    mapped = memory.map(one)
+    assert not memory.reclaimer.retire(one, NOW_S)
+    retired = memory.ledger.retired[one.name]
+    for _ in range(3 * reclaimer.DROPPED_PER_LOOK):
+        memory.reclaimer._look_at(retired, NOW_S + 1.0)
+        memory.reclaimer._look_at(retired, NOW_S + 2.0)
+    mapped.close()
+    for _ in range(3):
+        assert memory.reclaimer.next_sweep_s() <= NOW_S + 1.0
+        assert memory.reclaimer.sweep(NOW_S + 1.5) == 0
+    while memory.reclaimer.next_sweep_s() <= NOW_S + 1.5:
+        assert memory.reclaimer.sweep(NOW_S + 1.5) == 0
+    assert memory.looked() <= 1
+    assert memory.reclaimer.sweep(NOW_S + 2.0) == SMALL
+
+
 def test_nothing_is_freed_before_its_tick_is_over(memory: Memory) -> None:
     """A process may be just opening it, whichever releases it meanwhile."""
     (one,) = memory.publish(1)

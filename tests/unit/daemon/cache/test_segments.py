@@ -30,8 +30,7 @@ NDT = "ndt(leaf=5.0,min_points=3)"
 
 def ask(one: InnerDaemon, session: Any, number: int, layer: str) -> m.Cells:
     ids = tuple(one.cache.catalogue.id(i) for i in range(len(one.cache.catalogue)))
-    one.ask(session, Selected(number, ids, (layer,), 600.0))
-    return one.cells_of(number)
+    return one.cells_for(Selected(number, ids, (layer,), 600.0), session)
 
 
 @with_kernels
@@ -47,21 +46,6 @@ def test_ndt_is_served_where_its_points_would_never_fit(tmp_path: Path, inner: I
 
 
 @with_kernels
-def test_forgotten_layers_leave_no_tables(tmp_path: Path, inner: Inner) -> None:
-    made = make_map(tmp_path / "map", columns=2, rows=1, points=50)
-    one = inner(made.root)
-    session = one.session()
-    for number in range(1, 4):
-        ask(one, session, number, f"voxel(leaf={number}.0)")
-    assert len(one.cache.warm.layers) == len(one.cache.warm.tables) == 3
-    for resident in list(one.ledger.residents()):
-        one.reclaimer.retire(resident, one.now_s())
-    assert one.cache.warm.layers == {}
-    assert one.cache.warm.tables == {}
-    assert len(ask(one, session, 9, "voxel(leaf=1.0)").cells) == 2
-
-
-@with_kernels
 def test_any_number_of_layers_is_in_memory(
     tmp_path: Path, inner: Inner, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -73,8 +57,7 @@ def test_any_number_of_layers_is_in_memory(
     first, session, warm = (made.id("0_0.pcd"),), one.session(), one.cache.warm
     layers = [f"voxel(leaf={number}.0)" for number in range(1, 9)]
     for number, layer in enumerate(layers):
-        one.ask(session, Selected(number + 1, first, (layer,), 600.0))
-        assert len(one.cells_of(number + 1).cells) == 1
+        assert len(one.cells_for(Selected(number + 1, first, (layer,), 600.0), session).cells) == 1
     assert set(warm.layers) == set(layers)
     assert list(warm.tables) == layers[:2]
     assert len(ask(one, session, 20, "points").cells) == 8  # one at a time, of a layer that came last
@@ -89,6 +72,9 @@ def test_any_number_of_layers_is_in_memory(
     one.reclaimer.retire(one.ledger.by_key[Key(first[0], layers[5])], one.now_s())
     assert warm.versions(layers[5], everything) is None
     assert len(warm) == 15
+    for resident in list(one.ledger.residents()):
+        one.reclaimer.retire(resident, one.now_s())
+    assert (warm.layers, warm.tables, len(warm)) == ({}, {}, 0), "layers without segments leave no tables"
 
 
 def test_what_old_versions_are_of_is_forgotten_some_day(
@@ -143,16 +129,14 @@ def test_requests_meanwhile_are_answered_as_if_it_were_over(
     one.reload()
     for _ in range(turns):
         one.map_switch.run_step(one.now_s())
-    one.ask(one.session(), Differential(2, EVERYWHERE, packed=held, wait=30.0))
-    reply = one.cells_of(2)
+    reply = one.cells_for(Differential(2, EVERYWHERE, packed=held, wait=30.0))
     assert names(reply) == ["20_20.pcd"]
     assert len(reply.removed_packed) == 8  # of the cell that left; the changed one is replaced
     assert len(one.everything(3).cells) == CELLS - 1
     assert one.statistics.values["loads_started"] == loads + 1
     finish_change(one)
     assert one.cache.unentered == 0
-    one.ask(one.session(), Area(4, CircleMessage(1, 1, 2)))
-    assert "0_0.pcd" not in names(one.cells_of(4))
+    assert "0_0.pcd" not in names(one.cells_for(Area(4, CircleMessage(1, 1, 2))))
     assert one.ledger.resident_count == CELLS - 1
 
 
@@ -210,8 +194,7 @@ def test_heights() -> None:
 
 
 def load(one: InnerDaemon, request: int) -> Resident:
-    one.ask(one.session(), Selected(request, ("0_0.pcd",), wait=30.0))
-    assert len(one.cells_of(request).cells) == 1
+    assert len(one.cells_for(Selected(request, ("0_0.pcd",), wait=30.0)).cells) == 1
     return one.cache.warm.layers["points"][one.cache.index_of("0_0.pcd") or 0]
 
 
@@ -273,23 +256,10 @@ def test_what_others_cut_short_never_comes_back(inner: Inner, small_map: Divided
     one.run_until(lambda: not one.ledger.retired)
 
 
-def test_names_that_vanish(inner: Inner, small_map: DividedMap) -> None:
-    """The cell is loaded again; names of others do not matter, and retired ones are expected to go."""
-    one = inner(small_map.root)
-    first, lost = load(one, 1), one.cache.lost
-    assert lost.vanished() == set()
-    Path(one.shm_dir, "shmmap.other.1").write_bytes(b"")
-    Path(one.shm_dir, "shmmap.other.1").unlink()
-    Path(one.path_of(first.name.rpartition(".")[2])).unlink()
-    one.run_until(lambda: not one.cache.is_in_service(first))
-    assert load(one, 2) is not first
-
-
 def test_no_descriptors_left(inner: Inner, small_map: DividedMap) -> None:
     """What cannot be looked at is taken for pinned."""
     one = inner(small_map.root)
-    one.ask(one.session(), Area(1, EVERYWHERE, wait=30.0))
-    assert len(one.cells_of(1).cells) == 16
+    assert len(one.cells_for(Area(1, EVERYWHERE, wait=30.0)).cells) == 16
     for resident in list(one.ledger.residents()):
         one.reclaimer.retire(resident, one.now_s())
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)

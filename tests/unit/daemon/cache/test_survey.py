@@ -3,18 +3,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import cast
 
 import pytest
 
-from shmmap.daemon.cache import holders
 from shmmap.daemon.cache.holders import MAX_ASKED, UNKNOWN_SLOT, Holders, Survey, Usage
 from shmmap.daemon.cache.ledger import Segments
 from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.transport.sessions import Session, Sessions
 from shmmap.errors import Busy
+from shmmap.protocol.messages import Selected
 from tests.support import connections
+from tests.support.divided_map import DividedMap
+from tests.unit.daemon.whole_daemon import WholeDaemon
 
 SEGMENTS = 48
 pytestmark = pytest.mark.usefixtures("short_turns")
@@ -117,29 +120,15 @@ def test_one_session_waits_for_a_bounded_number_of_results() -> None:
     survey.ask(session(), results.append)
 
 
-def test_a_session_keeps_what_it_maps_or_was_just_given() -> None:
-    memory, mine = Memory(4), session()
-    mapped, dropped, fresh, gone = memory.those
-    mine.hold(memory.those)
-    memory.users = {mapped.name: [mine.slot]}
-    fresh.last_use_s = 99.5
-    memory.those.remove(gone)
-    for by_slot in (False, True):
-        memory.by_slot = by_slot
-        list(survey_of(memory).look_at(mine, 99.0, lambda: False))
-        assert (dropped in mine.residents()) is not by_slot, "only as the kernel knows who has what"
-    assert {one.name for one in mine.residents()} == {mapped.name, fresh.name, gone.name}
-
-
-def test_what_a_session_has_is_looked_up_one_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Oldest first, until enough was released, and no more than a bounded number."""
-    memory, mine = Memory(), session()
-    mine.hold(memory.those)
-    steps = survey_of(memory).look_at(mine, 99.0, lambda: len(mine.held) <= 10)
-    assert [memory.looked for _ in steps] == list(range(1, SEGMENTS - 9))
-    assert list(mine.held) == [one.version for one in memory.those[-10:]], "and no further"
-    monkeypatch.setattr(holders, "MAX_SEGMENTS", 20)
-    mine.hold(memory.those)
-    memory.looked = 0
-    list(survey_of(memory).look_at(mine, 99.0, lambda: False))
-    assert memory.looked == 20
+def test_a_session_may_leave_while_it_waits_for_many_results(
+    whole: Callable[..., WholeDaemon], small_map: DividedMap
+) -> None:
+    """Its connection ends as any other one does."""
+    one = whole(small_map.root)
+    assert one.ask(Selected(2, ("0_0.pcd",), wait=30.0)).cells
+    (waiting,), (connection,) = one.memory.sessions, one.service._connections
+    for _ in range(MAX_ASKED):
+        one.memory.cache.survey.ask(waiting, lambda _usage: None)
+    connection.end()
+    assert list(one.service._connections) == []
+    assert list(one.memory.sessions.departed.values()) == [waiting]

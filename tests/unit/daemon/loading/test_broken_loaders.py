@@ -145,8 +145,7 @@ def test_a_loader_that_fetches_and_says_nothing_is_replaced(puppet: Puppet) -> N
     one.run_until(lambda: puppet.worker not in list(one.pool))
     one.pool.deadline_s = 300.0
     assert puppet.process.wait() == -signal.SIGKILL
-    session = one.session()
-    one.ask(session, Area(2, CircleMessage(0, 0, 5), wait=30.0))
+    one.ask(one.session(), Area(2, CircleMessage(0, 0, 5), wait=30.0))
     assert (len(one.cells_of(2).cells), one.cells_of(2).failed) == (4, ())
 
 
@@ -159,12 +158,13 @@ def test_a_load_that_took_too_long_is_not_tried_again_at_once(puppet: Puppet) ->
     puppet.queue(1)
     one.offset_s += 301.0
     for request in (1, 2):
-        one.ask(session, Selected(request, ("0_0.pcd",), wait=900.0))
-        assert [failure.code for failure in one.cells_of(request).failed] == ["load_timeout"]
+        assert [
+            failure.code
+            for failure in one.cells_for(Selected(request, ("0_0.pcd",), wait=900.0), session).failed
+        ] == ["load_timeout"]
         assert not one.loads.by_key
     one.offset_s += 1.01
-    one.ask(session, Selected(3, ("0_0.pcd",), wait=900.0))
-    assert len(one.cells_of(3).cells) == 1
+    assert len(one.cells_for(Selected(3, ("0_0.pcd",), wait=900.0), session).cells) == 1
 
 
 def test_a_loader_that_cannot_be_killed(puppet: Puppet, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -183,8 +183,7 @@ def test_a_loader_that_cannot_be_killed(puppet: Puppet, monkeypatch: pytest.Monk
     assert [number for _, number in sent] == [signal.SIGKILL]
     assert not one.pool.has_room(computed=False)
     puppet.process.kill()
-    one.ask(session, Selected(2, ("20_20.pcd",), wait=900.0))
-    assert len(one.cells_of(2).cells) == 1
+    assert len(one.cells_for(Selected(2, ("20_20.pcd",), wait=900.0), session).cells) == 1
     puppet.process.wait()
 
 

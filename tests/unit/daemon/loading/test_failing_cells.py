@@ -36,25 +36,8 @@ def out_of_reach(small_map: DividedMap, monkeypatch: pytest.MonkeyPatch) -> Path
 
 def ask(one: InnerDaemon, request: int) -> list[str]:
     """Ask for the cell; return what came, or why it did not."""
-    one.ask(one.session(), Selected(request, (CELL,), wait=30.0))
-    reply = one.cells_of(request)
+    reply = one.cells_for(Selected(request, (CELL,), wait=30.0))
     return [Path(cell.id).name for cell in reply.cells] + [failed.code for failed in reply.failed]
-
-
-def test_it_is_tried_again_after_a_pause(inner: Inner, small_map: DividedMap, out_of_reach: Path) -> None:
-    one = inner(small_map.root)
-    one.stop_clock()
-    assert ask(one, 1) == ["offline"]
-    started = one.statistics.values["loads_started"]
-    assert ask(one, 2) == ["offline"]
-    assert one.statistics.values["loads_started"] == started, "not at once"
-    one.offset_s += 1.5
-    assert ask(one, 3) == ["offline"]
-    assert one.statistics.values["loads_started"] == started + 1
-    out_of_reach.unlink()
-    one.offset_s += 2.5
-    assert ask(one, 4) == [CELL]
-    assert not one.loads.failures
 
 
 def test_an_old_version_stays_until_the_new_one_can_be_reached(
@@ -67,8 +50,7 @@ def test_an_old_version_stays_until_the_new_one_can_be_reached(
     one.reload()
     out_of_reach.touch()
     packed = pack_versions([cell.version for cell in held.cells])
-    one.ask(one.session(), Differential(2, EVERYWHERE, packed=packed, wait=30.0))
-    reply = one.cells_of(2)
+    reply = one.cells_for(Differential(2, EVERYWHERE, packed=packed, wait=30.0))
     assert (reply.cells, reply.removed, reply.removed_packed) == ((), (), b"")
     assert [failed.code for failed in reply.failed] == ["offline"]
     fresh = one.everything(3)  # who has none of it gets the old one, marked
@@ -132,13 +114,6 @@ def broken(inner: Inner, small_map: DividedMap, monkeypatch: pytest.MonkeyPatch)
     for name in ("stat", "lstat", "open"):
         monkeypatch.setattr(os, name, guarded(getattr(os, name)))
     return one
-
-
-def test_an_unchanged_file_is_not_loaded_again(broken: InnerDaemon) -> None:
-    started = broken.statistics.values["loads_started"]
-    assert ask(broken, 2) == ["load_failed"]
-    assert broken.statistics.values["loads_started"] == started, "a look is no load"
-    assert not broken.loads.by_key
 
 
 def test_a_request_that_does_not_wait_is_answered_at_once(broken: InnerDaemon, small_map: DividedMap) -> None:

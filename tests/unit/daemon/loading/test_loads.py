@@ -19,16 +19,6 @@ def load(nbytes: int = 1 << 20) -> Load:
     return Load(Key("", ""), nbytes, 0.0, next(_numbers))
 
 
-def test_loads_are_counted_for_each_client() -> None:
-    queue = LoadQueue()
-    shared, own = load(), load()
-    for one, asker in ((shared, "a"), (shared, "b"), (own, "a"), (own, "a")):
-        queue.push(one, 1.0, asker)
-    assert [queue.count(asker) for asker in "abc"] == [2, 1, 0]
-    queue.discard(shared)
-    assert [queue.count(asker) for asker in "abc"] == [1, 0, 0]
-
-
 def start(queue: LoadQueue) -> Load | None:
     one = queue.next()
     if one is not None:

@@ -28,7 +28,7 @@ from shmmap.daemon.loading.look_ahead import (
     Wish,
 )
 from shmmap.daemon.travel.motion import Motion
-from shmmap.geometry import Area, AutowareSquare, Box, Circle
+from shmmap.geometry import Area, Circle
 from shmmap.origin.catalogue import Catalogue
 from shmmap.protocol.messages import Intent
 from shmmap.segment.layout import SourceStamp
@@ -271,13 +271,6 @@ def test_after_a_jump_the_pass_begins_from_the_start() -> None:
     assert town().boxes[found][:, 0].min() > 1200.0
 
 
-@pytest.mark.parametrize("area", [AutowareSquare(0.0, 0.0, 40.0), Box(-30.0, -40.0, 30.0, 40.0)])
-def test_other_areas_than_circles(area: Area) -> None:
-    found = {cell for _, cell in looked(path_of(driving(10.0), area))}
-    here = set(town().query(area)[0].tolist())
-    assert set(town().query(area.around(70.0, 0.0))[0].tolist()) - here <= found
-
-
 def test_of_an_area_with_very_many_cells_nothing() -> None:
     huge = Catalogue.from_cells(
         (f"/{n:06}", (float(n % 200), float(n // 200), n % 200 + 1.0, n // 200 + 1.0), SourceStamp(1, 1, 1))
@@ -429,20 +422,6 @@ def test_a_pass_that_takes_longer_than_its_interval_begins_again() -> None:
     assert second.cell != first.cell
     daemon.failed.clear()
     assert [wish.cell for wish in daemon.wishes(1.0 + PASS_S, 1)] == [first.cell]
-
-
-def test_in_an_outage_one_try_now_and_then_and_after_it_what_failed_first() -> None:
-    daemon = Daemon()
-    daemon.client("a")
-    begun = [wish.cell for wish in daemon.wishes(1.0, 5)]
-    daemon.outage()
-    assert daemon.next(1.0 + 0.5 * PROBE_S) is None
-    assert daemon.prefetch.next_s(1.0 + 0.5 * PROBE_S) == 1.0 + PROBE_S
-    assert len(daemon.wishes(1.0 + PROBE_S)) == 1
-    assert len(daemon.wishes(1.0 + 2 * PROBE_S)) == 1
-    daemon.loading.clear()
-    assert daemon.prefetch.health.ended(0.1, failed=False)
-    assert [wish.cell for wish in daemon.wishes(1.2 + 2 * PROBE_S, 5)] == begun
 
 
 def test_without_a_route_outages_are_prepared_for_after_the_first() -> None:

@@ -45,8 +45,7 @@ class Drive:
         session = self.session
         says(session, Intent(x, 10.0, vx=SPEED_MPS, route=((x, 10.0), (400.0, 10.0))), self.one.now_s())
         area = CircleMessage(x, 10.0, RADIUS_M)
-        self.one.ask(session, Area(self.request, area, self.layers, wait=wait))
-        return names(self.one.cells_of(self.request))
+        return names(self.one.cells_for(Area(self.request, area, self.layers, wait=wait), session))
 
 
 def count(one: InnerDaemon, name: str) -> int:
@@ -115,14 +114,6 @@ def test_loads_that_were_begun_in_an_outage_do_not_make_another_one(
     assert found == (True, IN_A_ROW)
 
 
-def test_layers_are_fetched_as_the_client_asks_for_them(prefetching: Callable[..., InnerDaemon]) -> None:
-    one = prefetching()
-    Drive(one, layers=("points", "voxel(0.5)"))
-    one.run_until(lambda: idle(one))
-    kinds = {resident.key.layer for resident in one.ledger.residents() if resident.prefetched}
-    assert len(kinds) == 2
-
-
 def test_without_a_path_nothing_is_fetched(inner: Inner, street: DividedMap) -> None:
     """For a client that stands still or has gone, or where prefetching is switched off."""
     off = inner(street.root, prefetch_share=0.0)
@@ -130,8 +121,7 @@ def test_without_a_path_nothing_is_fetched(inner: Inner, street: DividedMap) -> 
     off.run_until(lambda: idle(off))
     one = inner(street.root, prefetch_share=0.5)
     session = one.session()
-    one.ask(session, Area(1, CircleMessage(0.0, 10.0, RADIUS_M), wait=30.0))
-    one.cells_of(1)
+    one.cells_for(Area(1, CircleMessage(0.0, 10.0, RADIUS_M), wait=30.0), session)
     one.run_until(lambda: idle(one))
     assert [count(each, "prefetch_started") for each in (off, one)] == [0, 0]
     drive = Drive(one)
@@ -146,8 +136,7 @@ def test_without_a_path_nothing_is_fetched(inner: Inner, street: DividedMap) -> 
 def test_of_a_crowd_a_limited_number_of_clients_is_followed(inner: Inner, street: DividedMap) -> None:
     one = inner(street.root, prefetch_share=0.5)
     for number in range(MAX_PATHS + 10):
-        session = one.session()
-        one.ask(session, Area(number, CircleMessage(0.0, 10.0, 1.0), wait=0.0))
+        one.ask(one.session(), Area(number, CircleMessage(0.0, 10.0, 1.0), wait=0.0))
     one.run_until(lambda: not one.sessions.moved and not one.scheduler.prefetcher.cold)
     assert len(one.scheduler.prefetcher.prefetch.paths) == MAX_PATHS
 
@@ -366,8 +355,7 @@ def test_cells_fetched_ahead_are_events_and_shown_until_a_client_asks(
     session = one.session()
     route = ((-40.0, 0.0), (40.0, 0.0))
     says(session, Intent(-30.0, 0.0, 5.0, 0.0, None, route), one.now_s())
-    one.ask(session, Area(1, CircleMessage(-30.0, 0.0, 6.0), wait=30.0))
-    assert len(one.cells_of(1).cells) == 2
+    assert len(one.cells_for(Area(1, CircleMessage(-30.0, 0.0, 6.0), wait=30.0), session).cells) == 2
     one.run_until(lambda: count(one, "loads_finished") >= 8)
     events = map(decode_event, one.event_log.page(Recent(1)).events)
     loaded = {event.id: event.ahead for event in events if isinstance(event, Loaded)}
@@ -375,8 +363,7 @@ def test_cells_fetched_ahead_are_events_and_shown_until_a_client_asks(
     wished = {"-20_-20.pcd", "-20_0.pcd", "0_-20.pcd", "0_0.pcd", "20_-20.pcd", "20_0.pcd"}
     assert loaded == dict.fromkeys(asked_for, False) | dict.fromkeys(wished, True)
     assert shown_ahead(one) == loaded
-    one.ask(one.session(), Selected(2, ("0_0.pcd",), wait=30.0))
-    assert len(one.cells_of(2).cells) == 1
+    assert len(one.cells_for(Selected(2, ("0_0.pcd",), wait=30.0)).cells) == 1
     while one.cache.show_used(one.now_s()):
         pass
     assert shown_ahead(one) == loaded | {"0_0.pcd": False}

@@ -24,8 +24,8 @@ from shmmap.daemon.loading import worker_messages
 from shmmap.processes.start_child import MAX_PACKET_BYTES
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.header import PublishBlock
-from shmmap.segment.pins import in_use, prepare_process
-from shmmap.segment.version import Source, cell_version
+from shmmap.segment.pins import prepare_process
+from shmmap.segment.version import Source
 from tests.support.daemon_process import until, wait_ended, wait_readable
 from tests.support.divided_map import random_points, write_ascii, write_pcd
 
@@ -170,44 +170,6 @@ def loader(parent: Parent) -> Iterator[Loader]:
 def cell(path: Path, points: int) -> Path:
     write_pcd(path, random_points(np.random.default_rng(points), (0, 0), points))
     return path
-
-
-def test_a_good_file(loader: Loader, tmp_path: Path) -> None:
-    path = cell(tmp_path / "a.pcd", 1000)
-    loader.load(5, path)
-    done, fd = loader.receive()
-    assert isinstance(done, worker_messages.Done)
-    status = path.stat()
-    assert (done.number, done.points, done.dropped) == (5, 1000, 0)
-    assert done.stamp == struct.pack("<3q", status.st_size, status.st_mtime_ns, status.st_ctime_ns)
-    assert done.version == cell_version(str(path), done.stamp, BOX)
-    expected = random_points(np.random.default_rng(1000), (0, 0), 1000)
-    assert (done.z_min, done.z_max) == (float(expected["z"].min()), float(expected["z"].max()))
-    try:
-        size = os.fstat(fd).st_size
-        data = os.pread(fd, size, 0)
-        xyz = np.stack([expected[axis] for axis in "xyz"], axis=1)
-        assert xyz.tobytes() in data
-        assert expected["intensity"].tobytes() in data
-        assert done.header_bytes % 4096 == 0
-        assert os.fstat(fd).st_nlink == 0
-    finally:
-        os.close(fd)
-
-
-@pytest.mark.parametrize("content", [None, b"", b"VERSION .7\nFIELDS x y z\n", b"version https://git-lfs"])
-def test_a_bad_file_and_then_a_good_one(loader: Loader, tmp_path: Path, content: bytes | None) -> None:
-    bad = tmp_path / "bad.pcd"
-    if content is not None:
-        bad.write_bytes(content)
-    loader.load(1, bad)
-    loader.load(2, cell(tmp_path / "good.pcd", 10))
-    failed, fd = loader.receive()
-    assert isinstance(failed, worker_messages.Failed)
-    assert (failed.number, failed.code, fd) == (1, "load_failed", -1)
-    assert str(bad) in failed.message
-    assert (failed.stamp is None) is (content is None)
-    loader.done(2)
 
 
 @pytest.mark.parametrize("granted", [True, False])
@@ -441,20 +403,6 @@ def test_a_loader_that_cannot_be_watched_is_none(parent: Parent) -> None:
     assert said[-1] == worker_messages.Ended(-1, "pidfd_open: Too many open files")
     resource.prlimit(pid, resource.RLIMIT_NOFILE, limits)
     assert parent.fork().end() == 0
-
-
-def test_it_does_not_keep_what_it_filled(loader: Loader, tmp_path: Path) -> None:
-    """An open file would look like a reader's pin: once it says "done" ours is the only one."""
-    for number in range(20):
-        loader.load(number, cell(tmp_path / f"{number}.pcd", 10))
-        done, fd = loader.receive()
-        try:
-            assert isinstance(done, worker_messages.Done)
-            again = os.open(f"/proc/self/fd/{fd}", os.O_RDONLY)
-        finally:
-            os.close(fd)
-        assert not in_use(again)
-        os.close(again)
 
 
 def test_a_layer_is_made_of_points_in_memory_while_they_are_of_the_file_s_state(

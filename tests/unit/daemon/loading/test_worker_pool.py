@@ -168,8 +168,7 @@ def test_a_loader_that_computes_does_not_hinder_points(
     slow, quick = one.session(), one.session()
     one.ask(slow, Selected(1, ("0_0.pcd",), layers=("voxel(leaf=1.0)",), wait=900.0))
     one.run_until(lambda: [worker.layers for worker in one.pool] == [1])
-    one.ask(quick, Selected(2, ("20_20.pcd",), wait=900.0))
-    assert names(one.cells_of(2)) == ["20_20.pcd"]
+    assert names(one.cells_for(Selected(2, ("20_20.pcd",), wait=900.0), quick)) == ["20_20.pcd"]
     assert {key.layer for key in one.ledger.by_key} == {"points"}
     one.run_until(lambda: all(worker.ready for worker in one.pool))
     one.offset_s += 301.0

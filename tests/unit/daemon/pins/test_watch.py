@@ -10,7 +10,6 @@ import pytest
 
 from shmmap.daemon.pins.probe import PinSource, PinSupport, probe_pins
 from shmmap.daemon.pins.watch import PinWatch
-from shmmap.segment.attach import attach
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import prepare_process
 from tests.support.segment_reader import map_segment
@@ -134,20 +133,4 @@ def test_without_events_nothing_is_kept(directory: ShmDirectory) -> None:
     pins = PinWatch(directory)
     assert (pins.fd, pins.keep(NAME), pins.keeps(NAME), pins.closed()) == (-1, False, False, set())
     pins.watch_next_close(NAME)
-    pins.close()
-
-
-def test_an_attached_segment_and_its_last_view(directory: ShmDirectory) -> None:
-    """The mapping that the library makes is reported like any other."""
-    pins = PinWatch(directory, events=True)
-    pins.keep(NAME)
-    fd = os.open(directory.path + NAME, os.O_RDONLY)
-    os.close(fd)
-    assert reported(pins.fd)
-    pins.closed()
-    with pytest.raises(Exception, match="not a shmmap segment"):
-        attach(NAME, shm_dir=directory.path, slot=3)
-    assert reported(pins.fd)
-    assert pins.closed() == {NAME}
-    assert pins.is_used(NAME) is False
     pins.close()

@@ -53,17 +53,6 @@ def test_waits_that_are_refused(inner: Inner, small_map: DividedMap, warm: bool)
     assert not len(one.loads)
 
 
-def test_waits_that_are_answered_at_once(inner: Inner, small_map: DividedMap) -> None:
-    one = inner(small_map.root)
-    session = one.session()
-    for request, wait in ((1, None), (2, 0.0), (3, -0.0)):
-        one.ask(session, Area(request, EVERYWHERE, wait=wait))
-        (reply,) = [reply for _, reply in one.replies if reply.request == request]
-        assert len(reply.pending) == 16
-    one.ask(session, Area(4, EVERYWHERE, wait=3600.0))
-    assert len(one.cells_of(4).cells) == 16
-
-
 @pytest.mark.parametrize(
     ("area", "count"),
     [
@@ -79,9 +68,7 @@ def test_areas_at_the_end_of_the_world(
 ) -> None:
     """Some touch everything and some nothing; room can still be made and others served afterwards."""
     one = inner(small_map.root)
-    session = one.session()
-    one.ask(session, Area(1, area, wait=30.0))
-    reply = one.cells_of(1)
+    reply = one.cells_for(Area(1, area, wait=30.0))
     assert len(reply.cells) == count
     assert (reply.pending, reply.failed) == ((), ())
     assert len(one.everything(2).cells) == 16
@@ -202,24 +189,19 @@ def test_loads_that_one_process_waits_for(
     one = inner(small_map.root)
     with one.loaders_standing_still():
         greedy, other = one.session(), one.session()
-        one.ask(greedy, Area(1, EVERYWHERE))
-        assert len(one.cells_of(1).pending) == 16
-        one.ask(greedy, Area(2, EVERYWHERE))
-        assert len(one.cells_of(2).pending) == 16
+        assert len(one.cells_for(Area(1, EVERYWHERE), greedy).pending) == 16
+        assert len(one.cells_for(Area(2, EVERYWHERE), greedy).pending) == 16
         with pytest.raises(Busy, match="5 loads"):
             one.ask(greedy, Area(3, EVERYWHERE, ("voxel(leaf=1.0)",)))
-        one.ask(other, Area(4, EVERYWHERE, ("voxel(leaf=1.0)",)))
-        assert len(one.cells_of(4).pending) == 16
+        assert len(one.cells_for(Area(4, EVERYWHERE, ("voxel(leaf=1.0)",)), other).pending) == 16
     one.run_until(lambda: not len(one.loads))
-    one.ask(greedy, Area(5, EVERYWHERE, ("voxel(leaf=2.0)",), 30.0))
-    assert len(one.cells_of(5).cells) == 16
+    assert len(one.cells_for(Area(5, EVERYWHERE, ("voxel(leaf=2.0)",), 30.0), greedy).cells) == 16
 
 
 def test_layers(inner: Inner, small_map: DividedMap) -> None:
     one = inner(small_map.root)
-    session = one.session()
     with pytest.raises(BadRequest, match="17 layers in one request"):
-        one.ask(session, Area(1, EVERYWHERE, ("points",) * 17))
+        one.ask(one.session(), Area(1, EVERYWHERE, ("points",) * 17))
 
 
 def test_a_layer_that_would_look_into_too_many_cells(
@@ -261,8 +243,7 @@ def ids(many: InnerDaemon, first: int, last: int) -> tuple[str, ...]:
 def full(many: InnerDaemon, *, map_them: bool = False) -> tuple[Session, list[int]]:
     """Return a session that was handed 50 cells, which is all that it may keep; descriptors of them."""
     session = many.session()
-    many.ask(session, Selected(1, ids(many, 0, 50), wait=30.0))
-    cells = many.cells_of(1).cells
+    cells = many.cells_for(Selected(1, ids(many, 0, 50), wait=30.0), session).cells
     opened = [os.open(many.path_of(cell.segment), os.O_RDONLY) for cell in cells] if map_them else []
     for fd in opened:
         lock_slot(fd, session.slot)
@@ -296,15 +277,13 @@ def test_a_few_looks_a_turn(many: InnerDaemon, monkeypatch: pytest.MonkeyPatch) 
 def test_what_it_still_maps_counts(many: InnerDaemon) -> None:
     """It is refused what is too much."""
     session, opened = full(many, map_them=True)
-    many.ask(session, Selected(2, ids(many, 45, 60), wait=30.0))
-    reply = many.cells_of(2)
+    reply = many.cells_for(Selected(2, ids(many, 45, 60), wait=30.0), session)
     assert len(reply.cells) + len(reply.failed) == 15
     assert {failure.code for failure in reply.failed} == {"over_budget"}
     assert many.statistics.values["refused_quota"] == len(reply.failed) > 0
     for fd in opened:
         os.close(fd)
-    many.ask(session, Selected(4, ids(many, 50, 60), wait=30.0))
-    assert len(many.cells_of(4).cells) == 10
+    assert len(many.cells_for(Selected(4, ids(many, 50, 60), wait=30.0), session).cells) == 10
 
 
 HALF = BoxMessage(-1e3, -1e3, -1.0, 1e3)

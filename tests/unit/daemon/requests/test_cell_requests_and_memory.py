@@ -26,8 +26,7 @@ def test_evicted_while_a_request_waits_for_others(inner: Inner, small_map: Divid
     """It is put back or loaded once more while there is time: never forgotten."""
     one = inner(small_map.root)
     session = one.session()
-    one.ask(session, Selected(1, ("0_0.pcd", "20_20.pcd"), wait=30.0))
-    one.cells_of(1)
+    one.cells_for(Selected(1, ("0_0.pcd", "20_20.pcd"), wait=30.0), session)
     first = one.cache.warm.layers["points"][one.cache.index_of("0_0.pcd") or 0]
     second = one.cache.warm.layers["points"][one.cache.index_of("20_20.pcd") or 0]
     wanted = ("0_0.pcd", "20_20.pcd", "0_0.pcd", "20_0.pcd")
@@ -94,8 +93,10 @@ def test_what_is_mapped_and_asked_for_repeatedly_is_no_reason_to_wait(
     one = inner(small_map.root)
     one.ledger.budget_bytes = one.ledger.overhead_bytes + 4 * each + 8192
     reader, other = one.session("reader"), one.session("other")
-    one.ask(reader, Area(1, CircleMessage(0, 0, 5), wait=30.0))
-    opened = [os.open(one.path_of(cell.segment), os.O_RDONLY) for cell in one.cells_of(1).cells]
+    opened = [
+        os.open(one.path_of(cell.segment), os.O_RDONLY)
+        for cell in one.cells_for(Area(1, CircleMessage(0, 0, 5), wait=30.0), reader).cells
+    ]
     assert len(opened) == 4
     one.ask(other, Selected(2, ("20_20.pcd",), wait=3000.0))
     request = 10
@@ -114,8 +115,7 @@ def test_what_is_mapped_and_asked_for_repeatedly_is_no_reason_to_wait(
         os.close(fd)
     one.cells.release(reader.drop(list(reader.held)))
     one.offset_s += 2.0
-    one.ask(other, Selected(3, ("20_20.pcd",), wait=30.0))
-    assert names(one.cells_of(3)) == ["20_20.pcd"]
+    assert names(one.cells_for(Selected(3, ("20_20.pcd",), wait=30.0), other)) == ["20_20.pcd"]
 
 
 def test_room_is_made_for_several_loads_at_once(
@@ -126,8 +126,7 @@ def test_room_is_made_for_several_loads_at_once(
     one = inner(made.root)
     ids = [one.cache.catalogue.id(index) for index in range(104)]
     reader = one.session()
-    one.ask(reader, Selected(1, tuple(ids[:96]), wait=30.0))
-    assert len(one.cells_of(1).cells) == 96
+    assert len(one.cells_for(Selected(1, tuple(ids[:96]), wait=30.0), reader).cells) == 96
     one.cells.release(reader.drop(list(reader.held)))
     (each,) = {resident.nbytes for resident in one.ledger.residents()}
     estimate = one.cache.estimate(96, "points")
@@ -155,8 +154,7 @@ def test_two_loads_that_need_more_than_both_can_have(inner: Inner, small_map: Di
     one = inner(small_map.root, workers=2)
     half = one.cache.estimate(one.cache.index_of("0_0.pcd") or 0, "points")
     one.ledger.budget_bytes = one.ledger.overhead_bytes + 2 * half + 100_000
-    one.ask(one.session(), Selected(1, ("0_0.pcd", "20_20.pcd"), wait=3000.0))
-    reply = one.cells_of(1)
+    reply = one.cells_for(Selected(1, ("0_0.pcd", "20_20.pcd"), wait=3000.0))
     assert len(reply.cells) == 1
     assert [failure.code for failure in reply.failed] == ["over_budget"]
     assert one.statistics.values["loads_timed_out"] == 0
@@ -172,8 +170,7 @@ def test_the_end_of_a_loader_that_waits_for_room(inner: Inner, small_map: Divide
     one.ledger.budget_bytes = one.ledger.overhead_bytes + 50_000 * 12 + 2 * 4096 + 2 * each
     session = one.session()
     one.stop_clock()  # the cells handed out first stay in their grace
-    one.ask(session, Area(1, CircleMessage(0, 0, 5), wait=30.0))
-    assert len(one.cells_of(1).cells) == 4
+    assert len(one.cells_for(Area(1, CircleMessage(0, 0, 5), wait=30.0), session).cells) == 4
     one.ask(session, Selected(2, ("20_20.pcd", "20_0.pcd"), wait=900.0))
     one.run_until(lambda: one.scheduler.room.awaiting_grant)
     (worker,) = one.pool
@@ -194,8 +191,7 @@ def test_duplicates_count_once_for_the_quota(inner: Inner, small_map: DividedMap
     one = inner(small_map.root, quota_bytes=quota)
     session, ids = one.session(), ("0_0.pcd",) * 10 + ("20_20.pcd",) * 10
     for request in (1, 2):  # cold, then warm
-        one.ask(session, Selected(request, ids, wait=30.0))
-        reply = one.cells_of(request)
+        reply = one.cells_for(Selected(request, ids, wait=30.0), session)
         assert (names(reply), reply.failed) == (list(ids), ())
     reply = one.everything(3)
     assert {failure.code for failure in reply.failed} == {"over_budget"}

@@ -157,16 +157,13 @@ def test_heights_of_a_replaced_file_are_unknown(inner: Inner, small_map: Divided
     one = inner(small_map.root)
     session, high = one.session(), CircleMessage(10, 10, 1, 50.0, 60.0)
     one.everything()
-    one.ask(session, Area(2, high, wait=30.0))
-    assert one.cells_of(2).cells == ()
+    assert one.cells_for(Area(2, high, wait=30.0), session).cells == ()
     columns = random_points(np.random.default_rng(1), (0, 0), 20)
     columns["z"] = columns["z"] + np.float32(52.0)
     small_map.write_cell("0_0.pcd", (0, 0), columns)
     one.reload()
-    one.ask(session, Area(3, high, wait=30.0))
-    assert names(one.cells_of(3)) == ["0_0.pcd"]
-    one.ask(session, Differential(4, CircleMessage(10, 10, 1, 0.0, 8.0), wait=30.0))
-    assert one.cells_of(4).cells == ()
+    assert names(one.cells_for(Area(3, high, wait=30.0), session)) == ["0_0.pcd"]
+    assert one.cells_for(Differential(4, CircleMessage(10, 10, 1, 0.0, 8.0), wait=30.0), session).cells == ()
 
 
 def test_moved_cells_are_loaded_again_with_their_box(inner: Inner, small_map: DividedMap) -> None:
@@ -179,8 +176,7 @@ def test_moved_cells_are_loaded_again_with_their_box(inner: Inner, small_map: Di
         small_map.corners["20_20.pcd"] = (500, 500)
         small_map.write_metadata()
         one.reload()
-        one.ask(one.session(), Selected(2, ("0_0.pcd", "20_20.pcd"), wait=30.0))
-        reply = one.cells_of(2)
+        reply = one.cells_for(Selected(2, ("0_0.pcd", "20_20.pcd"), wait=30.0))
         held.close()
     assert [(cell.min_x, cell.min_y) for cell in reply.cells] == [(400.0, 400.0), (500.0, 500.0)]
     for cell in reply.cells:
@@ -213,8 +209,7 @@ def test_an_empty_map(inner: Inner, small_map: DividedMap) -> None:
     one.scheduler.map_changed()
     assert one.everything(2) == Cells(2, one.cache.epoch, empty.map_version, layers=("points",))
     packed = b"".join(cell.version.to_bytes(8, "little") for cell in before.cells)
-    one.ask(one.session(), Differential(3, EVERYWHERE, packed=packed))
-    assert sorted(one.cells_of(3).removed_packed) == sorted(packed)
+    assert sorted(one.cells_for(Differential(3, EVERYWHERE, packed=packed)).removed_packed) == sorted(packed)
     welcome = one.queries.welcome(one.session(), Hello(4, 2, 0))
     assert (welcome.cells, welcome.bounds) == (0, None)
     one.run_until(lambda: one.ledger.used_bytes == one.ledger.overhead_bytes)

@@ -50,8 +50,11 @@ class Served:
 
 def ask(inner: InnerDaemon, request: int, area: BoxMessage) -> dict[str, int]:
     """Ask for an area, wait; return the versions of the cells that came."""
-    inner.ask(inner.session(), Area(request, area, wait=30.0))
-    return {cell.id: cell.version for cell in inner.cells_of(request).cells if not cell.stale}
+    return {
+        cell.id: cell.version
+        for cell in inner.cells_for(Area(request, area, wait=30.0)).cells
+        if not cell.stale
+    }
 
 
 @pytest.fixture(scope="module")

@@ -214,8 +214,7 @@ def test_the_map_changes_while_differences_are_found(inner: Inner, tmp_path: Pat
 def test_very_much_is_released_in_several_turns(inner: Inner, made: DividedMap) -> None:
     one = inner(str(made.root))
     session = one.session()
-    one.ask(session, Area(1, EVERYWHERE, wait=LONG_S))
-    versions = [cell.version for cell in one.cells_of(1).cells]
+    versions = [cell.version for cell in one.cells_for(Area(1, EVERYWHERE, wait=LONG_S), session).cells]
     assert len(session.held) == CELLS
     dispatch = Dispatch(*[None] * len(fields(Dispatch)))  # type: ignore[arg-type]
     dispatch.cells = one.cells
@@ -233,8 +232,7 @@ def test_what_came_for_another_client_meanwhile_is_not_loaded_again(inner: Inner
     work = one.cells.area(session, Area(1, EVERYWHERE, wait=LONG_S))
     for _ in range(CELLS + 5):  # found, and the first loads asked for
         next(work)
-    one.ask(one.session(), Area(2, EVERYWHERE, wait=LONG_S))
-    assert len(one.cells_of(2).cells) == CELLS
+    assert len(one.cells_for(Area(2, EVERYWHERE, wait=LONG_S)).cells) == CELLS
     finish(work)
     assert len(one.cells_of(1).cells) == CELLS
     assert one.statistics.values["loads_started"] == CELLS

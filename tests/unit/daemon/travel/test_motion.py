@@ -103,11 +103,6 @@ def test_a_red_light_is_no_jump(at_origin: Motion) -> None:
     assert at_origin.travelled_m == pytest.approx(151.0)
 
 
-def test_silent_and_far_away_is_a_jump(at_origin: Motion) -> None:
-    at_origin.update(Intent(5000.0, 0.0), 3600.0)
-    assert at_origin.jumps == 2
-
-
 def test_what_was_fast_is_forgotten_slowly(at_origin: Motion) -> None:
     driven(at_origin, 0.0, 10.0, 20.0)
     driven(at_origin, 10.0, 70.0, 5.0)
@@ -155,19 +150,6 @@ def test_another_route_begins_at_its_start() -> None:
     assert motion.route.length_m == pytest.approx(900.0)
     motion.update(Intent(500.0, 0.0), 2.0)
     assert motion.route is None
-
-
-def test_a_trajectory_sent_again_each_second() -> None:
-    """150 m ahead, from where the client is: always at its beginning, without a jump."""
-    motion = Motion()
-    for second in range(60):
-        x = 12.0 * second
-        motion.update(Intent(x, 0.3, route=tuple((x + 10.0 * n, 0.0) for n in range(16))), float(second))
-        assert motion.route is not None
-        assert motion.along_m == pytest.approx(0.0)
-        assert motion.route.length_m - motion.along_m == pytest.approx(150.0)
-    assert motion.jumps == 1
-    assert motion.fastest_mps == pytest.approx(12.0)
 
 
 @settings(deadline=None)
@@ -222,13 +204,6 @@ def test_a_client_near_it_is_found_near_where_it_is(
         assert math.hypot(found_x - x, found_y - y) <= distance(route, x, y) + 10.0 + 1e-3
 
 
-def test_a_client_far_from_it_is_not_on_it() -> None:
-    route = Route([(0.0, 0.0), (1000.0, 0.0)])
-    assert route.find(500.0, OFF_ROUTE_M - 1.0) == pytest.approx(500.0)
-    assert route.find(500.0, OFF_ROUTE_M + 1.0) is None
-    assert route.find(500.0, OFF_ROUTE_M + 1.0, 500.0) is None
-
-
 def test_one_vertex_is_a_route_to_stay_at() -> None:
     route = Route([(5.0, 7.0)])
     assert (route.length_m, route.last_heading) == (0.0, 0.0)
@@ -262,15 +237,6 @@ def test_a_street_is_taken_both_ways() -> None:
         assert found >= come_m - BEHIND_M
         come_m = max(come_m, found)
     assert come_m == pytest.approx(2100.0 + 495.0)
-
-
-def test_a_client_that_leaves_its_route_and_comes_back() -> None:
-    route = Route([(0.0, 0.0), (2000.0, 0.0)])
-    assert route.find(300.0, 150.0, 280.0) is None
-    assert route.find(600.0, 50.0, None) == pytest.approx(600.0)
-    assert route.find(100.0, 0.0, 600.0) == pytest.approx(600.0 - BEHIND_M) or route.find(
-        100.0, 0.0, 600.0
-    ) == pytest.approx(100.0), "it went back a long way"
 
 
 def town(corners: int, radius: float) -> list[tuple[float, float]]:

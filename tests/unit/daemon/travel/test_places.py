@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from shmmap.daemon.travel.motion import Motion
 from shmmap.daemon.travel.places import (
     MAX_PLACES,
-    NOWHERE,
     SLOWEST_MPS,
     merged_places,
     places_of,
@@ -129,19 +128,6 @@ def test_a_route_of_4096_vertices_has_few_places() -> None:
     apart = np.hypot(*np.diff(places[1:-1, :2], axis=0).T)
     assert apart[0] < 60.0
     assert until_s(motion, 30_000.0, 0.0) == pytest.approx((30_000.0 - REACH_M) / 10.0, rel=0.1)
-
-
-def test_two_clients() -> None:
-    one, other = moving(0.0, 0.0, 10.0, 0.0), moving(5000.0, 0.0, -10.0, 0.0)
-    places = merged_places([places_of(one, REACH_M), places_of(other, REACH_M)])
-    assert len(places) == 2
-    cells = np.concatenate([box(2000.0, 0.0), box(4000.0, 0.0)])
-    assert until_needed(cells, places, 0.0) == pytest.approx([179.0, 79.0])
-
-
-def test_no_clients() -> None:
-    assert merged_places([]) is NOWHERE
-    assert NOWHERE.shape == (0, 8)
 
 
 @given(st.lists(st.tuples(coordinates, coordinates, st.floats(1, 30)), min_size=1, max_size=20), st.data())

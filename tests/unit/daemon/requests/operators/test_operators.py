@@ -25,21 +25,12 @@ ADMINS, OTHERS = 61010, 61011
 NO_ACCOUNT = 61999
 
 
-def test_root_and_the_daemons_own_user() -> None:
-    for uid in (0, os.geteuid()):
-        assert Authorization().allow(Peer(uid, OTHERS, 1), 0.0)
-
-
 @pytest.mark.parametrize("peer", [Peer(NO_ACCOUNT, OTHERS, 1), Peer(), Peer(NO_ACCOUNT, -1, 0)])
 def test_no_other_account_without_a_group(peer: Peer) -> None:
     with pytest.raises(NotPermitted, match="only root"):
         Authorization().require(peer, 0.0)
     with pytest.raises(NotPermitted, match=f"members of group {ADMINS}"):
         Authorization(str(ADMINS)).require(peer, 0.0)
-
-
-def test_the_group_of_the_process() -> None:
-    assert Authorization(str(ADMINS)).allow(Peer(NO_ACCOUNT, ADMINS, 1), 0.0)
 
 
 def test_a_peer_whose_user_the_kernel_does_not_report_is_no_member() -> None:
