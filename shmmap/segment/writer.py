@@ -125,6 +125,7 @@ class SegmentWriter:
         dropped_points: int,
         builder_version: int,
         outside_points: int = 0,
+        origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> SegmentHeader:
         """Write the header, which completes the segment.
 
@@ -145,6 +146,7 @@ class SegmentWriter:
             columns=tuple(columns),
             z_min=z_min,
             z_max=z_max,
+            origin=origin,
             source=source,
             source_digest=source_digest,
             source_points=source_points,
