@@ -46,7 +46,7 @@ HELD_PER_CELL: Final = 2
 MAX_HOLDERS: Final = 16
 """Holders named beside each cell that does not fit: those with the most memory."""
 NOTED_PER_STEP: Final = 256
-"""Cells handed out that are noted between two looks at the time."""
+"""Cells handed out that are noted, or freed, between two looks at the time."""
 PROMISED: Final = 1e9
 """Priority of a load promised by a "pending" alone: after the distances of all requested cells."""
 
@@ -293,11 +293,12 @@ class CellRequests:
         sizes: list[int] = []
         for cells in batched(found.cells):
             yield from wanted.pause()
-            for index, layer in cells:
+            for cell in cells:
+                index, layer = cell
                 resident = warm[layer].get(index) if layer in warm else None
                 resident = resident or cache.find_warm(index, layer, now_s)
                 if resident is None:
-                    cold.append((index, layer))
+                    cold.append(cell)
                 sizes.append(cache.estimate(index, layer) if resident is None else resident.nbytes)
         if not wanted.began_s:
             self._statistics.add("hits", len(found.cells) - len(cold))
@@ -419,6 +420,9 @@ class CellRequests:
         if wanted.began_s:
             self._statistics.add_duration("wait", int((now_s - wanted.began_s) * 1e9))
         yield from self._hand_out(wanted.session, answer, wanted.pace)
+        while found.cells:  # freeing very many takes time, too
+            del found.cells[-NOTED_PER_STEP:]
+            yield from wanted.pace.pause()
         return False
 
     def _waits_for(self, wanted: PendingRequest, index: int, layer: str, now_s: float) -> bool:

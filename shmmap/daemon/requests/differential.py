@@ -111,19 +111,21 @@ def difference(
         for unknown in versions.unknown(cells, layers):
             yield from wanted.pause()
             version_of(*unknown)
+    yield from wanted.pause(now=len(indices) > LARGE)
     packed = set(unpack_versions(message.packed))
+    yield from wanted.pause(now=len(packed) > LARGE)
+    gone = packed.copy()
     inside = set(indices)
     has = yield from _held_layers(wanted, message.held, inside, layers)
-    current: set[int] = set()
     for cells in batched(indices):
         yield from wanted.pause()
         for index in cells:
             for layer in layers:
                 version = version_of(index, layer)
-                current.add(version)
-                if version not in packed and layer not in has.get(index, ()):
+                if version in packed:
+                    gone.discard(version)
+                elif layer not in has.get(index, ()):
                     found.cells.append((index, layer))
-    gone = packed - current
     for versions_gone in batched([*gone]):
         yield from wanted.pause()
         for version in versions_gone:
