@@ -137,9 +137,16 @@ def event_listener(
             event_log.unsubscribe(connection)
 
     return Listener(
-        listening, watched, connections, statistics, b"XPUB", b"SUB", MAX_SUBSCRIPTION_BYTES,
-        on_message, event_log.unsubscribe,
-    )  # fmt: skip
+        listening,
+        watched,
+        connections,
+        statistics,
+        b"XPUB",
+        b"SUB",
+        MAX_SUBSCRIPTION_BYTES,
+        on_message,
+        event_log.unsubscribe,
+    )
 
 
 class MinuteLog:

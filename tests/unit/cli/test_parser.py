@@ -23,10 +23,38 @@ from shmmap.protocol.rows import LiveMapRow
 from tests.unit.conftest import Verb
 
 CONTRACT = {
-    "serve", "status", "ls", "show", "clients", "query", "reload", "evict", "pin", "unpin", "stop", "config",
-    "unit", "doctor", "cpp", "inspect", "export", "demo", "health", "version", "divide", "merge", "prepare",
-    "live", "top", "tail", "map", "metrics", "publish", "versions", "fetch",
-}  # fmt: skip
+    "serve",
+    "status",
+    "ls",
+    "show",
+    "clients",
+    "query",
+    "reload",
+    "evict",
+    "pin",
+    "unpin",
+    "stop",
+    "config",
+    "unit",
+    "doctor",
+    "cpp",
+    "inspect",
+    "export",
+    "demo",
+    "health",
+    "version",
+    "divide",
+    "merge",
+    "prepare",
+    "live",
+    "top",
+    "tail",
+    "map",
+    "metrics",
+    "publish",
+    "versions",
+    "fetch",
+}
 
 
 def every_parser(

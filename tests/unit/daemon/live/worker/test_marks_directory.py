@@ -47,8 +47,20 @@ def test_a_file_is_taken(marks: MarksDirectory, path: Path) -> None:
 
 
 OTHER_NAMES = [
-    "1b.7", "a.7", "01a.7x", "1a.", "1a", "1A.7", "01a.7", "../1a.7", "1a.7/x", "1a.-1", "1a.7\n", "", ".",
-]  # fmt: skip
+    "1b.7",
+    "a.7",
+    "01a.7x",
+    "1a.",
+    "1a",
+    "1A.7",
+    "01a.7",
+    "../1a.7",
+    "1a.7/x",
+    "1a.-1",
+    "1a.7\n",
+    "",
+    ".",
+]
 
 
 @pytest.mark.parametrize(
