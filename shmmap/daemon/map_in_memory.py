@@ -21,7 +21,7 @@ from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.config_live import LiveSettings, live_directory
 from shmmap.daemon.events.log import EventLog
-from shmmap.daemon.host.memory import choose_budget, loader_bytes, memory_limit_bytes, mount_of
+from shmmap.daemon.host.memory import choose_budget, loader_bytes, memory_limit_bytes
 from shmmap.daemon.live.messages import Begin
 from shmmap.daemon.loading.adoption import Adoption
 from shmmap.daemon.loading.prepared_parent import Early, PreparedParent
@@ -34,6 +34,7 @@ from shmmap.daemon.requests.pending_request import WaitingList
 from shmmap.daemon.transport.sessions import Sessions
 from shmmap.daemon.turns import WatchedDescriptors
 from shmmap.errors import CannotStart, ConfigError
+from shmmap.mounts import mount_of
 from shmmap.segment.directory import DEFAULT_SHM_DIR, ShmDirectory, is_full
 from shmmap.segment.names import segment_prefix
 from shmmap.segment.process_limits import limit_behind
@@ -54,7 +55,7 @@ def bytes_beside_cells(maps: int, *, cells: ShmDirectory, shm_dir: str, budget_b
     """Return the bytes that live maps need in the cells' file system: their budget, or the minimum."""
     if not maps:
         return 0
-    path = shm_dir or (cells.path if _huge_pages(cells.path) is None else DEFAULT_SHM_DIR)
+    path = shm_dir or _without_huge_pages(cells.path)
     try:
         same = os.stat(path).st_dev == os.stat(cells.path).st_dev
     except OSError:
@@ -91,14 +92,14 @@ def place_live_maps(
     CannotStart
         The directory cannot be used, or too little memory is free.
     """
-    path = shm_dir or (cells.path if _huge_pages(cells.path) is None else DEFAULT_SHM_DIR)
+    path = shm_dir or _without_huge_pages(cells.path)
     directory = ShmDirectory(path)
     try:
         size, free = directory.size_bytes(), directory.free_bytes()
         used = sum(directory.used_bytes(f"/shmmap-live.{instance}.{one.name}.") for one in live)
     finally:
         directory.close()
-    if huge := _huge_pages(directory.path):
+    if huge := mount_of(directory.path).huge_pages:
         raise ConfigError(
             f"{directory.path} has huge pages ({huge}): a chunk of a few KiB would take 2 MiB there",
             key="live_shm_dir",
@@ -134,12 +135,9 @@ def place_live_maps(
     return Begin(instance, maps, directory.path, marks, budget, gid, marks_gid)
 
 
-def _huge_pages(path: str) -> str | None:
-    """Return the mount option that gives a directory huge pages; None if it has none."""
-    mount = mount_of(path)
-    options = mount.options if mount is not None else []
-    huge = next((option for option in options if option.startswith("huge=")), "huge=never")
-    return None if huge in ("huge=never", "huge=advise") else huge
+def _without_huge_pages(path: str) -> str:
+    """Return a directory for chunks: that of the cells, unless it has huge pages."""
+    return DEFAULT_SHM_DIR if mount_of(path).huge_pages else path
 
 
 class FetchedFrom(NamedTuple):

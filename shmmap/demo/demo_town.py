@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
@@ -20,6 +20,7 @@ from shmmap.demo.program import Progress
 from shmmap.dividing.map_writer import MapWriter
 from shmmap.errors import ConfigError
 from shmmap.formats.png import png_bytes
+from shmmap.mounts import control_groups, group_values
 from shmmap.simulation.town import Town
 from shmmap.simulation.town_surfaces import BLOCK_METRES
 
@@ -101,10 +102,9 @@ def free_memory_bytes() -> int:
     """Return the memory that processes can still allocate, within a container's limit."""
     fields = dict(line.split(":") for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines())
     free = int(fields["MemAvailable"].split()[0]) << 10
-    group = Path("/sys/fs/cgroup")  # inside a container, the container's own
-    with contextlib.suppress(OSError, ValueError):  # "max", or no file: no limit
-        limit = int((group / "memory.max").read_text(encoding="ascii"))
-        free = min(free, limit - int((group / "memory.current").read_text(encoding="ascii")))
+    for group in chain.from_iterable(control_groups("memory")):
+        for limit in group_values([group], "memory.max"):
+            free = min(free, limit - sum(group_values([group], "memory.current")))
     return free
 
 

@@ -15,10 +15,11 @@ import time
 from typing import Final
 
 from shmmap.dividing.divide import divide
-from shmmap.dividing.settings import DivideSettings, NoProgress
+from shmmap.dividing.settings import DivideSettings
 from shmmap.errors import MapDataError, ShmmapError
 from shmmap.origin.map_report import LINK_NAME, read_report
 from shmmap.processes.start_child import channel_to_parent
+from shmmap.progress import NoProgress
 
 __all__ = ["main"]
 

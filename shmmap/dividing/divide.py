@@ -26,7 +26,7 @@ from shmmap.dividing.inputs import (
 )
 from shmmap.dividing.lattice import CellLattice
 from shmmap.dividing.partition import Partition, block_points_for, worker_count
-from shmmap.dividing.settings import DivideSettings, NoProgress, Progress, lattice_of, memory_left
+from shmmap.dividing.settings import DivideSettings, lattice_of, memory_left
 from shmmap.dividing.sources import RowLayout, Source, common_rows, field_types, open_source, with_axes
 from shmmap.dividing.workspace import Workspace
 from shmmap.errors import BadRequest, MapDataError
@@ -35,6 +35,7 @@ from shmmap.formats.durable_file import writing_errors
 from shmmap.formats.pcd.reader import PcdReader
 from shmmap.formats.source_file import refusal
 from shmmap.origin.map_report import DividedMap, far_cells_notes, write_report
+from shmmap.progress import NoProgress, Progress
 
 __all__ = ["divide"]
 

@@ -17,10 +17,10 @@ from shmmap.dividing.cell_files import CellFiles
 from shmmap.dividing.kernels import assign_cells
 from shmmap.dividing.lattice import CellLattice
 from shmmap.dividing.partition import Partition, block_points_for, worker_count
-from shmmap.dividing.settings import Progress
 from shmmap.dividing.sources import AXES
 from shmmap.errors import BadRequest
 from shmmap.formats.pcd.writer import write_pcd
+from shmmap.progress import Progress
 
 __all__ = ["reduce_voxels", "thin_out", "write_encoded"]
 

@@ -14,7 +14,7 @@ import numpy as np
 from shmmap.dividing.cell_files import pcd_fields
 from shmmap.dividing.frame import choose_units
 from shmmap.dividing.inputs import InputFile, check_output_place, check_space, check_unchanged, find_inputs
-from shmmap.dividing.settings import NoProgress, Progress, memory_left
+from shmmap.dividing.settings import memory_left
 from shmmap.dividing.sources import (
     NO_MOVE,
     RowLayout,
@@ -28,6 +28,7 @@ from shmmap.errors import BadRequest, MapDataError
 from shmmap.formats.durable_file import appearing_file, writing_errors
 from shmmap.formats.pcd.writer import pcd_header, pcd_rows
 from shmmap.origin.map_report import read_report
+from shmmap.progress import NoProgress, Progress
 
 __all__ = ["MERGED_ENCODINGS", "MergedCloud", "merge"]
 

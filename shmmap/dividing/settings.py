@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings for dividing a map, the remaining memory, and the interface for progress."""
+"""Settings for dividing a map, and the remaining memory."""
 
 from __future__ import annotations
 
 import math
 import os
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Final
 
 from shmmap.dividing.frame import Translation
 from shmmap.dividing.lattice import CellLattice
@@ -17,8 +17,6 @@ from shmmap.formats.pcd.header import ENCODINGS
 __all__ = [
     "MIN_MEMORY_BYTES",
     "DivideSettings",
-    "NoProgress",
-    "Progress",
     "lattice_of",
     "memory_left",
     "peak_memory_bytes",
@@ -144,29 +142,3 @@ def peak_memory_bytes() -> int:
             if line.startswith(b"VmHWM:"):
                 return int(line.split()[1]) << 10
     raise OSError("/proc/self/status has no VmHWM")
-
-
-class Progress(Protocol):
-    """Receives a run's progress; called from one thread, at least a few times a second."""
-
-    def stage(self, name: str, total: int) -> None:
-        """Begin a stage of ``total`` points; 0 if unknown."""
-
-    def advance(self, points: int) -> None:
-        """Count ``points`` further points as done."""
-
-    def done(self, points: int) -> None:
-        """End the run."""
-
-
-class NoProgress:
-    """Shows nothing."""
-
-    def stage(self, name: str, total: int) -> None:
-        """Ignore a stage."""
-
-    def advance(self, points: int) -> None:
-        """Ignore points."""
-
-    def done(self, points: int) -> None:
-        """Ignore the end."""

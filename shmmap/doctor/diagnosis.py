@@ -14,6 +14,7 @@ from typing import Final
 from shmmap.daemon.config import DaemonConfig
 from shmmap.doctor.store_probe import StoreAnswer, StoreQuestion, ask_store
 from shmmap.errors import ShmmapError
+from shmmap.mounts import Mount, mount_of
 from shmmap.origin.remote.store import is_published, is_url
 from shmmap.statistics.identity import DaemonIdentity
 from shmmap.statistics.reader import Snapshot
@@ -40,6 +41,10 @@ class Machine:
             return self.path(name).read_text(encoding="utf-8", errors="replace")
         except OSError:
             return ""
+
+    def mount_of(self, path: str) -> Mount:
+        """Return the mount that a path is on."""
+        return mount_of(path, str(self.root))
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,6 @@ from shmmap.daemon.config_live import SERVICE_STATE, live_directory
 from shmmap.daemon.prerequisites import account_name
 from shmmap.doctor.access import group_name, groups_of, is_in, paths_of_service
 from shmmap.doctor.diagnosis import ANSWER_S, Diagnosis
-from shmmap.doctor.memory import mount_of
 from shmmap.doctor.verdicts import Finding, fail, ok, skip, warn
 from shmmap.errors import ConfigError, ShmmapError
 from shmmap.protocol.rows import LiveMapRow
@@ -176,7 +175,7 @@ def check_live_memory(diagnosis: Diagnosis) -> Finding:
     if not rows and not diagnosis.config.live:
         return skip("no live map is set up")
     path = _live_shm_dir(diagnosis)
-    if huge := _huge_pages(diagnosis, path):
+    if huge := diagnosis.machine.mount_of(path).huge_pages:
         return fail(
             f"{path} has huge pages ({huge}): a chunk of a few KiB takes 2 MiB there",
             "name a tmpfs without them with live_shm_dir, such as /dev/shm",
@@ -203,13 +202,7 @@ def _live_shm_dir(diagnosis: Diagnosis) -> str:
     """Return the directory of chunks in memory: as set, else that of the cells unless on huge pages."""
     if diagnosis.config.live_shm_dir:
         return diagnosis.config.live_shm_dir
-    return DEFAULT_SHM_DIR if _huge_pages(diagnosis, diagnosis.shm_dir) else diagnosis.shm_dir
-
-
-def _huge_pages(diagnosis: Diagnosis, path: str) -> str:
-    options = mount_of(diagnosis.machine, path).options
-    huge = next((option for option in options if option.startswith("huge=")), "")
-    return "" if huge in ("huge=never", "huge=advise") else huge
+    return DEFAULT_SHM_DIR if diagnosis.machine.mount_of(diagnosis.shm_dir).huge_pages else diagnosis.shm_dir
 
 
 def _wrong_marks(diagnosis: Diagnosis, path: str) -> str:

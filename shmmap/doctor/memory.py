@@ -3,17 +3,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import stat
-from pathlib import PurePosixPath
-from typing import Final, NamedTuple
+from pathlib import Path
+from typing import Final
 
-from shmmap.daemon.host.memory import room_in_group
+from shmmap.daemon.host.memory import memory_limit_bytes, room_in_group
 from shmmap.daemon.prerequisites import account_name
 from shmmap.disk_budget import OBJECTS, DiskBudget, why_not_private
-from shmmap.doctor.diagnosis import Diagnosis, Machine
+from shmmap.doctor.diagnosis import Diagnosis
 from shmmap.doctor.verdicts import Finding, fail, ok, skip, warn
+from shmmap.mounts import control_groups
 from shmmap.origin.catalogue_bytes import default_cache_directory
 from shmmap.quantities import format_bytes
 from shmmap.service.huge_pages import kernel_version, of_all_sizes
@@ -24,28 +26,9 @@ __all__ = [
     "check_huge_pages",
     "check_memory_limit",
     "check_shared_memory",
-    "mount_of",
 ]
 
 CONTAINER_DEFAULT_BYTES: Final = 64 << 20  # size that Docker and Podman give /dev/shm
-
-
-class _Mount(NamedTuple):
-    point: str
-    kind: str
-    options: tuple[str, ...]
-
-
-def mount_of(machine: Machine, path: str) -> _Mount:
-    """Return the mount that contains a path."""
-    found = _Mount("/", "unknown", ())
-    for line in machine.text("/proc/self/mounts").splitlines():
-        _, point, kind, options, *_ = line.split()
-        point = re.sub(r"\\([0-7]{3})", lambda m: chr(int(m[1], 8)), point)
-        inside = PurePosixPath(path).is_relative_to(point)
-        if inside and len(point) >= len(found.point):
-            found = _Mount(point, kind, tuple(options.split(",")))
-    return found
 
 
 def check_shared_memory(diagnosis: Diagnosis) -> Finding:
@@ -55,7 +38,7 @@ def check_shared_memory(diagnosis: Diagnosis) -> Finding:
         state = os.statvfs(diagnosis.machine.path(path))
     except OSError as error:
         return fail(f"{path}: {error.strerror}", "name a directory on a tmpfs with shm_dir")
-    mount = mount_of(diagnosis.machine, path)
+    mount = diagnosis.machine.mount_of(path)
     if mount.kind not in ("tmpfs", "ramfs", "unknown"):
         return fail(
             f"{path} is on {mount.kind}: every segment would go to a disk",
@@ -101,38 +84,15 @@ def check_container(diagnosis: Diagnosis) -> Finding:
     return ok(f"in a container with {format_bytes(size)} of shared memory")
 
 
-def _cgroup_limit(machine: Machine, pid: int) -> tuple[int, int]:
-    """Return the smallest limit of the process's cgroups (0: none), and their bytes outside tmpfs."""
-    limits = []
-    private = 0
-    for line in machine.text(f"/proc/{pid or 'self'}/cgroup").splitlines():
-        _, controllers, path = line.split(":", 2)
-        if controllers == "":
-            places = ["/sys/fs/cgroup", "/sys/fs/cgroup/unified"]
-        elif "memory" in controllers.split(","):
-            places = ["/sys/fs/cgroup/memory"]
-        else:
-            continue
-        here = PurePosixPath(path)
-        for place in places:
-            used = dict(line.split()[:2] for line in machine.text(f"{place}{here}/memory.stat").splitlines())
-            private = max(private, sum(int(used.get(name, 0)) for name in ("anon", "rss", "kernel")))
-            for above in (here, *here.parents):
-                for file in ("memory.max", "memory.limit_in_bytes"):
-                    text = machine.text(f"{place}{above}/{file}").strip()
-                    limits += [int(text)] if text.isdigit() and int(text) < 1 << 60 else []
-    return min(limits, default=0), private
-
-
 def check_memory_limit(diagnosis: Diagnosis) -> Finding:
     """Check whether the cgroup's limit would kill the daemon before its budget is full.
 
     Segments are charged to the cgroup, as the daemon assumes when it chooses its budget.  Other memory of its
     processes is measured while the daemon runs.
     """
-    limit, private = _cgroup_limit(diagnosis.machine, diagnosis.pid)
-    budget = diagnosis.budget_bytes
-    if not limit:
+    process, root = diagnosis.pid or "self", str(diagnosis.machine.root)
+    limit, budget = memory_limit_bytes(process, root), diagnosis.budget_bytes
+    if limit is None:
         return ok("the control group sets no limit")
     chosen = format_bytes(budget) if budget else "chosen at start"
     fact = f"the control group allows {format_bytes(limit)}; budget {chosen}"
@@ -141,6 +101,9 @@ def check_memory_limit(diagnosis: Diagnosis) -> Finding:
     if budget > room:
         return fail(fact, f"{kills} {format_bytes(room)}, or raise MemoryMax=")
     if diagnosis.alive:
+        private = max(
+            _private_bytes(groups[0] / "memory.stat") for groups in control_groups("memory", process, root)
+        )
         fact += f", and its processes use {format_bytes(private)}"
         if budget + private > limit:
             left = format_bytes(max(limit - private, 1 << 20))
@@ -148,10 +111,17 @@ def check_memory_limit(diagnosis: Diagnosis) -> Finding:
     return ok(fact)
 
 
+def _private_bytes(stat_file: Path) -> int:
+    """Return the bytes outside tmpfs in a ``memory.stat`` of either version of control groups."""
+    with contextlib.suppress(OSError):
+        used = dict(line.split()[:2] for line in stat_file.read_text(encoding="ascii").splitlines())
+    return sum(int(used.get(name, 0)) for name in ("anon", "rss", "kernel"))
+
+
 def check_huge_pages(diagnosis: Diagnosis) -> Finding:
     """Check whether segments use huge pages, and whether they help on this kernel."""
     machine = diagnosis.machine
-    mount = mount_of(machine, diagnosis.shm_dir)
+    mount = machine.mount_of(diagnosis.shm_dir)
     chosen = next((option for option in mount.options if option.startswith("huge=")), "huge=never")
     switch = re.search(r"\[(\w+)\]", machine.text("/sys/kernel/mm/transparent_hugepage/shmem_enabled"))
     release = machine.text("/proc/sys/kernel/osrelease")

@@ -62,6 +62,21 @@ class CellSource:
     outside_points: int = 0
     warnings: tuple[str, ...] = ()
 
+    @classmethod
+    def of(cls, header: SegmentHeader, columns: dict[str, NDArray[Any]], box: Box) -> CellSource:
+        """Return the source with some columns of a ``points`` layer that has this header."""
+        units = {column.name: column.unit for column in header.columns if column.name in columns}
+        return cls(
+            points=PointTable(columns, units, box),
+            stamp=header.source,
+            digest=header.source_digest,
+            source_points=header.source_points,
+            dropped_points=header.dropped_points,
+            z_min=header.z_min,
+            z_max=header.z_max,
+            outside_points=header.outside_points,
+        )
+
 
 def read_source(path: str, box: Box, needs: Sequence[str] | None) -> CellSource:
     """Read the columns that a layer needs (None: all) of a PCD file.
@@ -108,15 +123,8 @@ def read_source(path: str, box: Box, needs: Sequence[str] | None) -> CellSource:
         )
 
 
-def read_segment(
-    fd: int, box: Box, needs: Sequence[str] | None, header: SegmentHeader | None = None
-) -> CellSource:
+def read_segment(fd: int, box: Box, needs: Sequence[str] | None) -> CellSource:
     """Read the columns that a layer needs from an open ``points`` segment, which does not stay mapped.
-
-    Parameters
-    ----------
-    header
-        Header of a segment that is not published yet; None: it is read from the segment.
 
     Raises
     ------
@@ -127,8 +135,7 @@ def read_segment(
     OSError
         The segment cannot be read.
     """
-    if header is None:
-        header, _ = read_header(fd)
+    header, _ = read_header(fd)
     _check_size(sum(column.nbytes for column in header.columns), header.cell_id)
     columns: dict[str, NDArray[Any]] = {}
     for column in header.columns:
@@ -142,16 +149,7 @@ def read_segment(
                     raise SegmentCorrupt("the segment is shorter than its header says")
                 left, at = left[got:], at + got
             columns[column.name] = array
-    return CellSource(
-        points=PointTable(columns, {c.name: c.unit for c in header.columns if c.name in columns}, box),
-        stamp=header.source,
-        digest=header.source_digest,
-        source_points=header.source_points,
-        dropped_points=header.dropped_points,
-        z_min=header.z_min,
-        z_max=header.z_max,
-        outside_points=header.outside_points,
-    )
+    return CellSource.of(header, columns, box)
 
 
 def _check_size(nbytes: int, name: str) -> None:

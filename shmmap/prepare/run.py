@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
 
 from shmmap.layers.disk_cache import LayerCache
 from shmmap.layers.sources import Neighbour
@@ -17,21 +16,9 @@ from shmmap.layers.spec import canonical_layers
 from shmmap.layers.versions import MAX_NEIGHBOURS, LayerVersions
 from shmmap.origin.catalogue import Catalogue
 from shmmap.prepare.task_pool import CellDone, CellTask, TaskPool, decode_done
+from shmmap.progress import Progress
 
-__all__ = ["Failure", "PrepareProgress", "Prepared", "prepare_map", "task_of"]
-
-
-class PrepareProgress(Protocol):
-    """Receives the progress of a run."""
-
-    def stage(self, name: str, total: int) -> None:
-        """Begin a stage of ``total`` cells."""
-
-    def advance(self, cells: int) -> None:
-        """Add ``cells`` to the number of finished cells."""
-
-    def done(self, cells: int) -> None:
-        """Report that all cells are done."""
+__all__ = ["Failure", "Prepared", "prepare_map", "task_of"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +50,7 @@ def prepare_map(
     cache_dir: str,
     cache_bytes: int,
     workers: int,
-    progress: PrepareProgress,
+    progress: Progress,
 ) -> Prepared:
     """Compute layers of every cell of a map into the disk cache.
 

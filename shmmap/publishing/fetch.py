@@ -15,7 +15,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.dividing.settings import Progress
 from shmmap.dividing.workspace import Workspace
 from shmmap.errors import BadRequest, MapDataError, MapMissing
 from shmmap.failpoints import step
@@ -29,6 +28,7 @@ from shmmap.origin.remote.published_index import Root
 from shmmap.origin.remote.published_object import POINTS, ObjectName, read_bare_header, rows_of
 from shmmap.origin.remote.store import Store
 from shmmap.origin.remote.zstd_frame import unpack_frame
+from shmmap.progress import Progress
 
 __all__ = ["FetchedMap", "fetch_map"]
 

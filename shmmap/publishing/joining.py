@@ -38,7 +38,7 @@ from shmmap.origin.remote.slice_part import (
     with_parts,
 )
 from shmmap.origin.remote.store import Store, refuse_read_only
-from shmmap.prepare.run import PrepareProgress
+from shmmap.progress import Progress
 from shmmap.publishing.new_version import (
     CONCURRENT_REQUESTS,
     absent_objects,
@@ -85,9 +85,7 @@ class Joined:
     objects: int = 0
 
 
-def join_slices(
-    store: Store, run: str, *, progress: PrepareProgress, signer: MapSigner | None = None
-) -> Joined:
+def join_slices(store: Store, run: str, *, progress: Progress, signer: MapSigner | None = None) -> Joined:
     """Create a version from the parts of all slices of a run, and make it current.
 
     Parameters
@@ -129,7 +127,7 @@ class _Join:
         run: RunName,
         base: BaseVersion,
         seen: CurrentState,
-        progress: PrepareProgress,
+        progress: Progress,
         signer: MapSigner | None,
     ) -> None:
         self._store = store

@@ -28,7 +28,7 @@ from shmmap.origin.remote.map_versions import (
 )
 from shmmap.origin.remote.slice_part import PARTS
 from shmmap.origin.remote.store import Store, refuse_read_only
-from shmmap.prepare.run import PrepareProgress
+from shmmap.progress import Progress
 from shmmap.publishing.restore import objects_of
 
 __all__ = ["KEEP_DAYS", "LEAST_KEEP_DAYS", "Pruned", "prune_versions"]
@@ -52,7 +52,7 @@ class Pruned:
     kept_bytes: int = 0
 
 
-def prune_versions(store: Store, *, keep_days: float = KEEP_DAYS, progress: PrepareProgress) -> Pruned:
+def prune_versions(store: Store, *, keep_days: float = KEEP_DAYS, progress: Progress) -> Pruned:
     """Remove versions that have not been current for ``keep_days``, and objects that only they have.
 
     Parameters
@@ -132,7 +132,7 @@ def _entry(store: Store, version: int) -> Entry | None:
         return None
 
 
-def _needed(store: Store, progress: PrepareProgress, result: Pruned) -> set[bytes]:
+def _needed(store: Store, progress: Progress, result: Pruned) -> set[bytes]:
     """Return the hashes of all objects of the versions that are listed or current now."""
     roots: dict[str, Current] = {}
     for version in list_entries(store):
@@ -165,7 +165,7 @@ def _remove_parts(store: Store, old_s: float) -> int:
 
 
 def _remove_objects(
-    store: Store, needed: set[bytes], old_s: float, progress: PrepareProgress, result: Pruned
+    store: Store, needed: set[bytes], old_s: float, progress: Progress, result: Pruned
 ) -> None:
     names = {digest.hex() for digest in needed}
     needed.clear()

@@ -39,8 +39,9 @@ from shmmap.origin.remote.published_index import (
     pack_shard,
 )
 from shmmap.origin.remote.store import Store, refuse_read_only
-from shmmap.prepare.run import Failure, PrepareProgress, task_of
+from shmmap.prepare.run import Failure, task_of
 from shmmap.prepare.task_pool import CellTask
+from shmmap.progress import Progress
 from shmmap.publishing.messages import CellSent, NotSent, PublishSettings, write_known_objects
 from shmmap.publishing.new_version import (
     begin_version,
@@ -111,7 +112,7 @@ def publish_map(
     resend: bool = False,
     signer: MapSigner | None = None,
     workers: int,
-    progress: PrepareProgress,
+    progress: Progress,
 ) -> Published:
     """Publish a map, and make it current.
 
@@ -173,7 +174,7 @@ class _Run:
         catalogue: Catalogue,
         store: Store,
         names: tuple[str, ...],
-        progress: PrepareProgress,
+        progress: Progress,
         *,
         resend: bool,
         signer: MapSigner | None,

@@ -21,7 +21,7 @@ from shmmap.origin.remote.map_versions import (
 from shmmap.origin.remote.published_index import Root
 from shmmap.origin.remote.published_object import blob_path
 from shmmap.origin.remote.store import Store
-from shmmap.prepare.run import PrepareProgress
+from shmmap.progress import Progress
 from shmmap.publishing.new_version import CONCURRENT_REQUESTS, absent_objects, begin_version, switch_version
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ class Restored(NamedTuple):
 
 
 def restore_version(
-    store: Store, version: int, progress: PrepareProgress, signer: MapSigner | None = None
+    store: Store, version: int, progress: Progress, signer: MapSigner | None = None
 ) -> Restored:
     """Make the content of an earlier version current again; all its objects must still exist.
 
@@ -92,7 +92,7 @@ def _require_entry(store: Store, entry: Entry) -> None:
         raise MapMissing(f"version {entry.version} at {store.url} has just been pruned") from None
 
 
-def _look_for_objects(store: Store, current: Current, progress: PrepareProgress) -> int:
+def _look_for_objects(store: Store, current: Current, progress: Progress) -> int:
     root = read_root(store, current)
     progress.stage("look for objects", root.cells)
     missing: list[str] = []

@@ -8,7 +8,6 @@ Points of the next cells are fetched while a cell is made.  Cells are made and s
 from __future__ import annotations
 
 import contextlib
-import os
 import socket
 import sys
 import threading
@@ -24,15 +23,14 @@ from shmmap.layers.build import cache_key
 from shmmap.layers.contract import Box
 from shmmap.layers.disk_cache import LayerCache
 from shmmap.layers.points import LAYER
-from shmmap.layers.sources import CellJob, CellSource, read_segment
+from shmmap.layers.sources import CellJob, CellSource
 from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.origin.remote.object_tier import KeptObjects, ObjectTier
 from shmmap.origin.remote.published_object import (
-    CellIdentity,
     ObjectName,
+    read_points,
     stamp_of,
     unpack_source,
-    write_segment,
 )
 from shmmap.origin.remote.zstd_frame import unpack_frame
 from shmmap.prepare.task_pool import CellTask, Ready, decode_task, encode
@@ -93,18 +91,13 @@ class PublishedPoints:
             The points cannot be fetched.
         """
         name = unpack_source(source)[LAYER].name
-        identity = CellIdentity(source.name, box, "", self.stamp(source))
         path = f"{self._objects.url}/{name.path}"
-        fd = os.memfd_create("points", os.MFD_CLOEXEC)
         try:
             unpacked = unpack_frame(self._frame(name), name.raw, name=path, exact=True)
-            header = write_segment(unpacked, fd, identity, LAYER, name=path)
-            del unpacked
-            return read_segment(fd, box, needs, header)
+            header, columns = read_points(unpacked, source, needs, name=path)
         except MapDataError as error:
             raise LoadFailed(str(error), cell_id=source.name) from None
-        finally:
-            os.close(fd)
+        return CellSource.of(header, columns, box)
 
     def fill(
         self,

@@ -53,8 +53,9 @@ from shmmap.origin.remote.slice_part import (
 )
 from shmmap.origin.remote.store import Store, Tag, put_over, refuse_read_only
 from shmmap.origin.remote.zstd_frame import DAMAGED, unpack_frame
-from shmmap.prepare.run import Failure, PrepareProgress, task_of
+from shmmap.prepare.run import Failure, task_of
 from shmmap.prepare.task_pool import CellTask
+from shmmap.progress import Progress
 from shmmap.publishing.messages import CellSent, NotSent, SliceSettings
 from shmmap.publishing.new_version import (
     CONCURRENT_REQUESTS,
@@ -174,7 +175,7 @@ def prepare_slice(
     settings: SliceSettings,
     current: Current | None = None,
     workers: int,
-    progress: PrepareProgress,
+    progress: Progress,
 ) -> Sliced:
     """Make a slice and send its objects, shards and part to the store.
 
@@ -274,7 +275,7 @@ class _Slice:
         number: int,
         slices: int,
         settings: SliceSettings,
-        progress: PrepareProgress,
+        progress: Progress,
     ) -> None:
         self._store = store
         self._base = base

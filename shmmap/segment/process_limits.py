@@ -31,7 +31,6 @@ __all__ = [
 ]
 
 _GONE_S: Final = 0.0001
-_GROUPS: Final = "/sys/fs/cgroup"
 _NO_ROOM: Final = ("Cannot allocate memory", "failed to map segment")
 """Messages of the dynamic loader for a library for which there is no memory."""
 
@@ -171,25 +170,10 @@ def no_threads_left(what: str = "") -> LimitReached:
 
 
 def _group_limit() -> str | None:
-    """Return the strictest thread limit of this process's control group and its ancestors."""
-    limits = []
-    try:
-        with open("/proc/self/cgroup", encoding="utf-8") as file:
-            paths = [line.rstrip("\n").split(":", 2) for line in file]
-    except (OSError, ValueError):
-        return None
-    for _, controllers, path in paths:
-        if controllers not in ("", "pids"):
-            continue
-        directory = f"{_GROUPS}{'/pids' if controllers else ''}{path.rstrip('/')}"
-        while directory.startswith(_GROUPS):
-            try:
-                with open(f"{directory}/pids.max", encoding="utf-8") as file:
-                    most = file.read().strip()
-                limits += [int(most)] if most.isdecimal() else []
-            except (OSError, ValueError):
-                pass
-            directory = os.path.dirname(directory)
+    """Return the strictest thread limit of this process's control groups and their ancestors."""
+    from shmmap.mounts import control_groups, group_values
+
+    limits = [most for groups in control_groups("pids") for most in group_values(groups, "pids.max")]
     return f"{min(limits)} in the control group (pids.max)" if limits else None
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from shmmap.dividing.settings import NoProgress
 from shmmap.errors import BadRequest, InstanceBusy, MapMissing, ShmmapError
 from shmmap.origin.map_directory import open_map
 from tests.process.conftest import Meanwhile
@@ -19,6 +18,7 @@ pytest.importorskip("zstandard", reason="zstandard is not installed")
 
 from shmmap.origin.remote import map_versions
 from shmmap.origin.remote.opened_store import open_store
+from shmmap.progress import NoProgress
 from shmmap.publishing import prune, publish, restore
 from shmmap.publishing.messages import PublishSettings
 from shmmap.publishing.prune import Pruned

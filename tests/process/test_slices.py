@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shmmap.dividing.settings import NoProgress
 from shmmap.errors import InstanceBusy, MapDataError, ShmmapError
 from tests.process.conftest import Meanwhile
 from tests.support.command_line import Verbs
@@ -34,6 +33,7 @@ import zstandard
 from shmmap.origin.remote import map_versions
 from shmmap.origin.remote.opened_store import open_store
 from shmmap.origin.remote.slice_part import Part, read_run, unpack_part
+from shmmap.progress import NoProgress
 from shmmap.publishing import joining, prune
 from tests.support.message_pack import pack, unpack
 

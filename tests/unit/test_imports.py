@@ -38,6 +38,8 @@ BASE = {
     "large_tables",
     "disk_budget",
     "lazy_imports",
+    "mounts",
+    "progress",
     "version",
 }
 PARTS = {
@@ -51,11 +53,13 @@ PARTS = {
     "processes": set[str](),
     "geometry": {"errors"},
     "formats": {"errors", "columns", "geometry", "logfmt", "processes"},
-    "segment": {"errors", "columns", "geometry", "failpoints", "lazy_imports"},
+    "segment": {"errors", "columns", "geometry", "failpoints", "lazy_imports", "mounts"},
     "protocol": {"errors", "columns", "geometry"},
     "kernel_cache": {"logfmt", "version"},
     "compiling": {"kernel_cache", "version"},
     "version": set[str](),
+    "mounts": set[str](),
+    "progress": set[str](),
     "large_tables": set[str](),
     "disk_budget": {"failpoints"},
     "lazy_imports": {"errors", "segment.process_limits"},

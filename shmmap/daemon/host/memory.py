@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Limits of the daemon's memory: shared for cells, private per loader, restricted by the control group.
 
-Mounts (proc_pid_mountinfo(5)) show where control groups are, and which file system a path is on.
-
 Shared memory is charged to the control group of the process that wrote it first, even after that process has
 ended.  Exceeding the limit raises no error: the kernel kills a process.  So the limit has to be known before.
 """
@@ -10,22 +8,17 @@ ended.  Exceeding the limit raises no error: the kernel kills a process.  So the
 from __future__ import annotations
 
 import contextlib
-import os
-import re
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 from shmmap.errors import CannotStart, ConfigError
+from shmmap.mounts import control_groups, group_values
 from shmmap.segment.directory import ShmDirectory
 
 __all__ = [
-    "Mount",
     "choose_budget",
     "loader_bytes",
     "memory_limit_bytes",
-    "mount_of",
-    "mounts",
     "out_of_memory_kills",
     "room_in_group",
 ]
@@ -138,86 +131,22 @@ def choose_budget(
 
 
 _NO_LIMIT: Final = 1 << 60
-"""Version 1 expresses "no limit" as the largest possible number of pages."""
-_FILES: Final = {"cgroup2": "memory.max", "cgroup": "memory.limit_in_bytes"}
+"""Version 1 of control groups expresses "no limit" as the largest possible number of pages."""
 
 
-def memory_limit_bytes(proc: str = "/proc/self") -> int | None:
-    """Return the lowest memory limit of this process's control group and its ancestors; None for none.
-
-    Covers versions 1 and 2 of control groups (cgroups(7)).
-
-    Parameters
-    ----------
-    proc
-        Directory with ``cgroup`` and ``mountinfo`` of the process.
-    """
-    groups = _groups(Path(proc, "cgroup"))
-    limits: list[int] = []
-    for kind, root, mount, options in mounts(f"{proc}/mountinfo"):
-        group = groups.get(kind)
-        if group is None or (kind == "cgroup" and "memory" not in options):
-            continue
-        inside = os.path.relpath(group, root) if _is_below(group, root) else "."
-        place = Path(mount, inside)
-        while True:
-            limits += [int(line) for line in _lines(place / _FILES[kind]) if line.isdecimal()]
-            if place == Path(mount):
-                break
-            place = place.parent
+def memory_limit_bytes(process: int | str = "self", root: str = "/") -> int | None:
+    """Return the lowest memory limit of a process's control groups and their ancestors; None for none."""
+    limits = [
+        limit
+        for groups in control_groups("memory", process, root)
+        for name in ("memory.max", "memory.limit_in_bytes")
+        for limit in group_values(groups, name)
+    ]
     return min((limit for limit in limits if limit < _NO_LIMIT), default=None)
 
 
 def out_of_memory_kills(vmstat: str = "/proc/vmstat") -> int:
     """Return how many processes the kernel has killed because memory ran out, anywhere on the machine."""
-    return next((int(line.split()[1]) for line in _lines(Path(vmstat)) if line.startswith("oom_kill ")), 0)
-
-
-def _groups(path: Path) -> dict[str, str]:
-    """Return the control group of the process, by hierarchy."""
-    found: dict[str, str] = {}
-    for line in _lines(path):
-        _number, controllers, group = line.split(":", 2)
-        if not controllers:
-            found["cgroup2"] = group
-        elif "memory" in controllers.split(","):
-            found["cgroup"] = group
-    return found
-
-
-def _is_below(group: str, root: str) -> bool:
-    return group == root or group.startswith(root.rstrip("/") + "/")
-
-
-def _lines(path: Path) -> list[str]:
-    """Return the lines of a file; none if it cannot be read."""
-    try:
-        return path.read_text(encoding="utf-8", errors="surrogateescape").splitlines()
-    except OSError:
-        return []
-
-
-class Mount(NamedTuple):
-    """A mount: its file system type, that file system's mounted directory, the mount point, and options."""
-
-    kind: str
-    root: str
-    point: str
-    options: list[str]
-
-
-def mounts(path: str = "/proc/self/mountinfo") -> Iterator[Mount]:
-    """Yield every mount of a process, in order of mounting; none if they cannot be read."""
-    with contextlib.suppress(OSError), open(path, encoding="utf-8", errors="surrogateescape") as file:
-        for line in file:
-            before, _, after = line.partition(" - ")
-            fields, (kind, _source, options) = before.split(), after.split()[:3]
-            point = re.sub(r"\\([0-7]{3})", lambda found: chr(int(found[1], 8)), fields[4])
-            yield Mount(kind, fields[3], point, options.split(","))
-
-
-def mount_of(path: str) -> Mount | None:
-    """Return the mount that a path is on; None if unknown."""
-    below = os.path.realpath(path) + "/"
-    around = [mount for mount in mounts() if below.startswith(mount.point.rstrip("/") + "/")]
-    return max(reversed(around), key=lambda mount: len(mount.point), default=None)
+    with contextlib.suppress(OSError), open(vmstat, encoding="ascii") as file:
+        return next((int(line.split()[1]) for line in file if line.startswith("oom_kill ")), 0)
+    return 0

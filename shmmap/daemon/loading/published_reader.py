@@ -9,12 +9,10 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any, Final
-
-from numpy.typing import NDArray
+from typing import Final
 
 from shmmap.errors import LoadFailed, MapDataError, Offline, ShmmapError
-from shmmap.layers.contract import Box, PointTable
+from shmmap.layers.contract import Box
 from shmmap.layers.points import LAYER
 from shmmap.layers.sources import CellJob, CellSource
 from shmmap.layers.spec import LayerSpec
@@ -24,14 +22,13 @@ from shmmap.origin.remote.published_object import (
     CellIdentity,
     LayerSource,
     ObjectName,
-    read_bare_header,
-    rows_of,
+    read_points,
     stamp_of,
     unpack_source,
     write_segment,
 )
 from shmmap.origin.remote.zstd_frame import DAMAGED, unpack_frame
-from shmmap.segment.layout import SegmentHeader, SourceStamp
+from shmmap.segment.layout import SegmentHeader
 from shmmap.segment.version import Source, Stamp
 
 __all__ = ["CONCURRENT_FETCHES", "PublishedReader"]
@@ -215,27 +212,10 @@ class PublishedReader:
         """
         name = unpack_source(source)[LAYER].name
         try:
-            unpacked = self._unpacked(name)
-            header = read_bare_header(unpacked, LAYER, name=self._path(name))
+            header, columns = read_points(self._unpacked(name), source, needs, name=self._path(name))
         except MapDataError as error:
             raise LoadFailed(str(error), cell_id=source.name) from None
-        stamp = self.stamp(source)
-        columns: dict[str, NDArray[Any]] = {
-            column.name: rows_of(unpacked, column)
-            for column in header.columns
-            if needs is None or column.name in needs
-        }
-        units = {column.name: column.unit for column in header.columns if column.name in columns}
-        return CellSource(
-            points=PointTable(columns, units, box),
-            stamp=SourceStamp.from_token(stamp),
-            digest=stamp[:16],
-            source_points=header.source_points,
-            dropped_points=header.dropped_points,
-            z_min=header.z_min,
-            z_max=header.z_max,
-            outside_points=header.outside_points,
-        )
+        return CellSource.of(header, columns, box)
 
     def fill(
         self,

@@ -29,9 +29,9 @@ from shmmap.daemon.host.inotify import (
     SELF_MOVED,
     Inotify,
 )
-from shmmap.daemon.host.memory import mount_of
 from shmmap.errors import CannotStart
 from shmmap.logfmt import log
+from shmmap.mounts import mount_of
 
 __all__ = ["FileWatch", "directories_of"]
 
@@ -130,7 +130,7 @@ class FileWatch:
             if refused is not None and refused.errno not in (errno.ENOENT, errno.ENOTDIR):
                 self.close()
                 raise _refusal(refused)
-            if (mount := mount_of(directory)) is not None and mount.kind in _REMOTE:
+            if (mount := mount_of(directory)).kind in _REMOTE:
                 log.warning(
                     "changes made on other machines are not noticed",
                     directory=directory,

@@ -51,6 +51,7 @@ __all__ = [
     "pack_object",
     "pack_source",
     "read_bare_header",
+    "read_points",
     "rows_of",
     "stamp_of",
     "to_millimetres",
@@ -345,6 +346,27 @@ def read_bare_header(
         if len(counts) != 1 or not np.isfinite(mm_origin).all():
             raise MapDataError("its points are not what their flag says", path=name, cause=DAMAGED)
     return header
+
+
+def read_points(
+    unpacked: bytes | memoryview, source: Source, needs: Sequence[str] | None, *, name: str = ""
+) -> tuple[SegmentHeader, dict[str, NDArray[Any]]]:
+    """Return the header of a cell's unpacked points, and the columns that are needed (None: all).
+
+    Errors are those of `write_segment`.
+    """
+    stamp = stamp_of(source)
+    header = msgspec.structs.replace(
+        read_bare_header(unpacked, POINTS, name=name),
+        source=SourceStamp.from_token(stamp),
+        source_digest=stamp[:16],
+    )
+    columns = {
+        column.name: rows_of(unpacked, column)
+        for column in header.columns
+        if needs is None or column.name in needs
+    }
+    return header, columns
 
 
 def rows_of(unpacked: bytes | bytearray | memoryview, column: Column) -> NDArray[Any]:

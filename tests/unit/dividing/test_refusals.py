@@ -11,8 +11,8 @@ import pytest
 
 from shmmap.dividing.divide import divide
 from shmmap.dividing.merge import merge
-from shmmap.dividing.settings import NoProgress
 from shmmap.errors import BadRequest, CannotWrite, MapDataError, MapMissing
+from shmmap.progress import NoProgress
 from tests.support.clouds import cloud_file, divide_quickly, expected_rows, map_rows, rows_of, xyzircaedt
 
 

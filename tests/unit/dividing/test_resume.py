@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from shmmap.dividing.divide import divide
-from shmmap.dividing.settings import DivideSettings, NoProgress
+from shmmap.dividing.settings import DivideSettings
 from shmmap.dividing.workspace import Workspace
 from shmmap.errors import InstanceBusy
 from shmmap.formats.pcd.writer import write_pcd
 from shmmap.origin.map_report import DividedMap
+from shmmap.progress import NoProgress
 from tests.support.cloud_bytes import write_las
 from tests.support.clouds import Columns, expected_rows, map_rows, rows_of, xyzircaedt
 

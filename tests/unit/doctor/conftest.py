@@ -57,6 +57,12 @@ class Ward:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
 
+    def mounts(self, *mounts: str) -> None:
+        """Mount file systems, each ``POINT KIND OPTIONS``."""
+        parts = [mount.split() for mount in mounts]
+        lines = [f"1 1 0:1 / {point} rw - {kind} none {options}\n" for point, kind, options in parts]
+        self.file("/proc/self/mountinfo", "".join(lines))
+
     def diagnosis(
         self, seen: Snapshot | None = None, *, uid: int = USER, file: str = "", **settings: object
     ) -> Diagnosis:

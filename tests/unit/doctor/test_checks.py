@@ -47,7 +47,7 @@ def test_every_check_says_something_about_this_machine(tmp_path: Path) -> None:
 
 def test_what_does_not_apply_is_skipped(ward: Ward) -> None:
     """Without a daemon, and with a map of files, whose store is never asked."""
-    ward.file("/proc/self/mounts", "")
+    ward.mounts()
     skipped = {one.name: one.fact for one in diagnose(ward.diagnosis(map_path="/maps/town")) if one.skipped}
     for name in ("reload", "signature", "cells", "cache size", "prefetching"):
         assert skipped.pop(name) == "no daemon runs"
@@ -127,14 +127,17 @@ def test_what_the_daemon_uses_already_is_no_shortage(ward: Ward) -> None:
 
 
 def test_a_directory_that_is_no_tmpfs(ward: Ward) -> None:
-    ward.file("/proc/self/mounts", "/dev/vda / ext4 rw 0 0\ntmpfs /dev/shm tmpfs rw 0 0\n")
+    ward.mounts("/ ext4 rw", "/dev/shm tmpfs rw")
     (ward.root / "var/my maps").mkdir(parents=True)
     assert memory.check_shared_memory(ward.diagnosis()).state == "ok"
     found = memory.check_shared_memory(ward.diagnosis(shm_dir="/var/my maps"))
     assert (found.state, "ext4" in found.fact) == ("fail", True)
-    ward.file("/proc/self/mounts", "/dev/vda / ext4 rw 0 0\ntmpfs /var/my\\040maps tmpfs rw 0 0\n")
+    ward.mounts("/ ext4 rw", "/var/my\\040maps tmpfs rw")
     assert memory.check_shared_memory(ward.diagnosis(shm_dir="/var/my maps")).state == "ok"
     assert memory.check_shared_memory(ward.diagnosis(shm_dir="/no/such")).state == "fail"
+
+
+GROUPS = ("/sys/fs/cgroup cgroup2 rw", "/sys/fs/cgroup/memory cgroup rw,memory")
 
 
 @pytest.mark.parametrize(
@@ -156,6 +159,7 @@ def test_a_directory_that_is_no_tmpfs(ward: Ward) -> None:
 def test_limits_of_the_control_group(
     ward: Ward, line: str, file: str, limit: str, budget: int, state: str
 ) -> None:
+    ward.mounts(*GROUPS)
     ward.file("/proc/self/cgroup", line + "\n")
     ward.file(file, limit + "\n")
     found = memory.check_memory_limit(ward.diagnosis(budget_bytes=budget))
@@ -165,6 +169,7 @@ def test_limits_of_the_control_group(
 
 def test_what_the_processes_use_beside_the_segments(ward: Ward) -> None:
     """Measured while the daemon runs: pages of a tmpfs are the segments' own, and not counted again."""
+    ward.mounts(*GROUPS)
     ward.file("/proc/self/cgroup", "0::/a\n")
     ward.file("/sys/fs/cgroup/a/memory.max", f"{300 << 20}\n")
     for used, state in ((100 << 20, "ok"), (200 << 20, "warn")):
@@ -298,7 +303,7 @@ NEW, OLD = "6.14.0-rc1-x", "6.13.12"
 def test_huge_pages(
     ward: Ward, options: str, switch: str, release: str, state: str, fact: str, advice: str
 ) -> None:
-    ward.file("/proc/self/mounts", f"tmpfs /dev/shm tmpfs {options} 0 0\n")
+    ward.mounts(f"/dev/shm tmpfs {options}")
     ward.file("/proc/sys/kernel/osrelease", release + "\n")
     choices = "always within_size advise never deny force ".replace(f"{switch} ", f"[{switch}] ")
     if switch:
@@ -396,8 +401,7 @@ def test_the_disk_of_live_maps(ward: Ward, monkeypatch: pytest.MonkeyPatch) -> N
 def test_chunks_are_not_on_huge_pages(ward: Ward) -> None:
     marks(ward)
     settings = (LiveSettings("lidar"),)
-    plain, huge = "tmpfs /dev/shm tmpfs rw 0 0\n", "tmpfs /run/huge tmpfs rw,huge=within_size 0 0\n"
-    ward.file("/proc/self/mounts", plain + huge)
+    ward.mounts("/dev/shm tmpfs rw", "/run/huge tmpfs rw,huge=within_size")
 
     def check(**more: Any) -> Finding:
         return live.check_live_memory(ward.diagnosis(live=settings, **more))

@@ -14,7 +14,6 @@ from tests.support.divided_map import DividedMap, make_map
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 
-from shmmap.dividing.settings import NoProgress
 from shmmap.layers.sources import FILES
 from shmmap.origin.map_directory import open_map
 from shmmap.origin.remote.map_versions import read_shards, require_current
@@ -22,6 +21,7 @@ from shmmap.origin.remote.object_tier import KeptObjects
 from shmmap.origin.remote.opened_store import open_store
 from shmmap.origin.remote.published_object import LayerSource, pack_source
 from shmmap.origin.remote.store import Store
+from shmmap.progress import NoProgress
 from shmmap.publishing.joining import numbers_text
 from shmmap.publishing.messages import PublishSettings
 from shmmap.publishing.publish import publish_map

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from shmmap.origin.remote.map_versions import Current, Entry
     from shmmap.origin.remote.store import Store
     from shmmap.origin.remote.verify_apart import Verified
-    from shmmap.prepare.run import PrepareProgress
+    from shmmap.progress import Progress
     from shmmap.publishing.signing import MapSigner
 
 __all__ = ["add_fetch", "add_versions", "run_fetch", "run_versions"]
@@ -139,7 +139,7 @@ def run_versions(args: argparse.Namespace) -> int:
 
 
 def _roll_back(
-    store: Store, version: int, progress: PrepareProgress, signer: MapSigner | None, *, as_json: bool
+    store: Store, version: int, progress: Progress, signer: MapSigner | None, *, as_json: bool
 ) -> None:
     from shmmap.publishing.restore import restore_version
 
@@ -185,7 +185,7 @@ def _rotate(store: Store, signer: MapSigner, role: str, *, as_json: bool) -> Non
     print_line(f"the new key is {rotated.key}: it belongs wherever the old one was")
 
 
-def _prune(store: Store, keep_days: float | None, progress: PrepareProgress, *, as_json: bool) -> None:
+def _prune(store: Store, keep_days: float | None, progress: Progress, *, as_json: bool) -> None:
     from shmmap.publishing.prune import KEEP_DAYS, prune_versions
 
     pruned = prune_versions(store, keep_days=KEEP_DAYS if keep_days is None else keep_days, progress=progress)

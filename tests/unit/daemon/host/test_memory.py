@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Budgets on file systems of given sizes, memory limits of control groups, mounts, and memory given back."""
+"""Budgets on file systems of given sizes, memory limits of control groups, and memory given back."""
 
 from __future__ import annotations
 
@@ -13,14 +13,10 @@ from typing import Final
 
 import pytest
 
-from shmmap.daemon.host import memory
 from shmmap.daemon.host.memory import (
-    Mount,
     choose_budget,
     loader_bytes,
     memory_limit_bytes,
-    mount_of,
-    mounts,
     out_of_memory_kills,
 )
 from shmmap.errors import CannotStart, ConfigError
@@ -130,20 +126,20 @@ def test_what_a_loader_may_use(
 
 
 def tree(root: Path, cgroup: str, mounts: str, limits: dict[str, str]) -> str:
-    """Make a process's view; ``@`` in ``mounts`` stands for the root."""
-    (root / "proc").mkdir()
-    (root / "proc/cgroup").write_text(cgroup)
-    (root / "proc/mountinfo").write_text(mounts.replace("@", str(root)))
+    """Make a process's view of a machine; return the machine's root."""
+    (root / "proc/self").mkdir(parents=True)
+    (root / "proc/self/cgroup").write_text(cgroup)
+    (root / "proc/self/mountinfo").write_text(mounts)
     for name, text in limits.items():
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         (root / name).write_text(text + "\n")
-    return str(root / "proc")
+    return str(root)
 
 
-V2 = "30 23 0:26 / @/cg rw,nosuid shared:4 - cgroup2 cgroup2 rw,nsdelegate\n"
+V2 = "30 23 0:26 / /cg rw,nosuid shared:4 - cgroup2 cgroup2 rw,nsdelegate\n"
 V1 = (
-    "35 25 0:30 / @/cg/cpu rw - cgroup cgroup rw,cpu,cpuacct\n"
-    "36 25 0:31 / @/cg/memory rw - cgroup cgroup rw,memory\n"
+    "35 25 0:30 / /cg/cpu rw - cgroup cgroup rw,cpu,cpuacct\n"
+    "36 25 0:31 / /cg/memory rw - cgroup cgroup rw,memory\n"
 )
 
 
@@ -159,7 +155,7 @@ V1 = (
 )
 def test_version_2(tmp_path: Path, limits: dict[str, str], expected: int | None) -> None:
     """The lowest of its own and every one around it."""
-    assert memory_limit_bytes(tree(tmp_path, "0::/a.slice/b.service\n", V2, limits)) == expected
+    assert memory_limit_bytes(root=tree(tmp_path, "0::/a.slice/b.service\n", V2, limits)) == expected
 
 
 def test_version_1(tmp_path: Path) -> None:
@@ -169,18 +165,18 @@ def test_version_1(tmp_path: Path) -> None:
         "cg/memory/memory.limit_in_bytes": "9223372036854771712",
         "cg/cpu/x/memory.limit_in_bytes": "1",
     }
-    assert memory_limit_bytes(tree(tmp_path, group, V1, limits)) == 67108864
+    assert memory_limit_bytes(root=tree(tmp_path, group, V1, limits)) == 67108864
 
 
 def test_inside_a_container(tmp_path: Path) -> None:
     """Its own group is what is mounted there."""
-    mounts = "36 25 0:31 /docker/1234 @/cg/memory rw - cgroup cgroup rw,memory\n"
+    mounts = "36 25 0:31 /docker/1234 /cg/memory rw - cgroup cgroup rw,memory\n"
     limits = {"cg/memory/memory.limit_in_bytes": "5000"}
-    assert memory_limit_bytes(tree(tmp_path, "4:memory:/docker/1234\n", mounts, limits)) == 5000
+    assert memory_limit_bytes(root=tree(tmp_path, "4:memory:/docker/1234\n", mounts, limits)) == 5000
 
 
 def test_nothing_there(tmp_path: Path) -> None:
-    assert memory_limit_bytes(str(tmp_path)) is None
+    assert memory_limit_bytes(root=str(tmp_path)) is None
 
 
 def test_processes_killed_for_lack_of_memory(tmp_path: Path) -> None:
@@ -188,41 +184,6 @@ def test_processes_killed_for_lack_of_memory(tmp_path: Path) -> None:
     assert out_of_memory_kills(str(tmp_path / "vmstat")) == 3
     assert out_of_memory_kills(str(tmp_path / "none")) == 0
     assert out_of_memory_kills() >= 0
-
-
-LINES = (
-    "22 1 0:20 / / rw - ext4 /dev/sda1 rw\n"
-    "30 22 0:30 / /maps rw shared:1 - nfs4 server:/maps rw,vers=4\n"
-    "31 22 0:31 / /maps\\040néw rw - xfs /dev/sdb1 rw\n"
-    "32 22 0:32 /sub /maps rw - ext3 /dev/sdc1 rw\n"
-)
-
-
-def test_every_mount_is_given(tmp_path: Path) -> None:
-    (tmp_path / "mountinfo").write_text(LINES)
-    found = list(mounts(str(tmp_path / "mountinfo")))
-    assert found[1] == Mount("nfs4", "/", "/maps", ["rw", "vers=4"])
-    assert (found[2].point, found[3].root) == ("/maps néw", "/sub")
-    assert list(mounts(str(tmp_path / "none"))) == []
-
-
-@pytest.mark.parametrize(
-    ("path", "kind"), [("/", "ext4"), ("/mapsets", "ext4"), ("/maps/town", "ext3"), ("/maps néw/a", "xfs")]
-)
-def test_the_innermost_mount_counts_and_the_last_at_one_place(
-    path: str, kind: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    (tmp_path / "mountinfo").write_text(LINES)
-    found = list(mounts(str(tmp_path / "mountinfo")))
-    monkeypatch.setattr(memory, "mounts", lambda: iter(found))
-    mount = mount_of(path)
-    assert mount is not None
-    assert mount.kind == kind
-
-
-def test_file_systems_of_this_machine() -> None:
-    kinds = [mount.kind for path in ("/proc/self", "/dev/shm") if (mount := mount_of(path)) is not None]
-    assert kinds == ["proc", "tmpfs"]
 
 
 PROGRAM: Final = """

@@ -12,11 +12,11 @@ import pytest
 
 from shmmap.daemon import map_in_memory
 from shmmap.daemon.config_live import LiveSettings
-from shmmap.daemon.host import memory
-from shmmap.daemon.host.memory import Mount, choose_budget
+from shmmap.daemon.host.memory import choose_budget
 from shmmap.daemon.live.messages import Begin
 from shmmap.daemon.map_in_memory import CEILING_BYTES, bytes_beside_cells, place_live_maps
 from shmmap.errors import CannotStart, ConfigError
+from shmmap.mounts import Mount
 from shmmap.segment.directory import ShmDirectory
 
 MIB = 1 << 20
@@ -46,7 +46,7 @@ def placed(
 def mounted(monkeypatch: pytest.MonkeyPatch, *rows: tuple[str, str]) -> None:
     """Have the machine's mounts be these: where, and the options of the file system."""
     found = [Mount("tmpfs", "/", point, options.split(",")) for point, options in rows]
-    monkeypatch.setattr(memory, "mounts", lambda: iter(found))
+    monkeypatch.setattr("shmmap.mounts.mounts", lambda _root: iter(found))
 
 
 def test_beside_the_cells(cells: ShmDirectory) -> None:
