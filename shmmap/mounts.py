@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator
-from pathlib import Path
 from typing import NamedTuple
 
 __all__ = ["Mount", "control_groups", "group_values", "mount_of", "mounts"]
@@ -32,7 +31,7 @@ class Mount(NamedTuple):
 
 def mounts(root: str = "/") -> Iterator[Mount]:
     """Yield every mount of this process, in order of mounting; none if they cannot be read."""
-    for line in _lines(Path(root, "proc/self/mountinfo")):
+    for line in _lines(f"{root}/proc/self/mountinfo"):
         before, _, after = line.partition(" - ")
         fields, (kind, _source, options) = before.split(), after.split()[:3]
         point = re.sub(r"\\([0-7]{3})", lambda found: chr(int(found[1], 8)), fields[4])
@@ -41,12 +40,11 @@ def mounts(root: str = "/") -> Iterator[Mount]:
 
 def mount_of(path: str, root: str = "/") -> Mount:
     """Return the mount that a path is on; of type ``unknown`` if the mounts cannot be read."""
-    below = os.path.realpath(path) + "/"
-    around = [mount for mount in mounts(root) if below.startswith(mount.point.rstrip("/") + "/")]
+    around = [mount for mount in mounts(root) if _is_in(os.path.realpath(path), mount.point)]
     return max(reversed(around), key=lambda mount: len(mount.point), default=Mount("unknown", "/", "/", []))
 
 
-def control_groups(controller: str, process: int | str = "self", root: str = "/") -> Iterator[list[Path]]:
+def control_groups(controller: str, process: int | str = "self", root: str = "/") -> Iterator[list[str]]:
     """Yield the directory of a process's control group and those of its ancestors, nearest first.
 
     Versions 1 and 2 of control groups are separate hierarchies; a process may be in a group of both.
@@ -57,7 +55,7 @@ def control_groups(controller: str, process: int | str = "self", root: str = "/"
         What the groups limit: ``memory``, ``pids``.
     """
     groups: dict[str, str] = {}
-    for line in _lines(Path(root, f"proc/{process}/cgroup")):
+    for line in _lines(f"{root}/proc/{process}/cgroup"):
         _number, controllers, group = line.split(":", 2)
         if not controllers or controller in controllers.split(","):
             groups["cgroup" if controllers else "cgroup2"] = group
@@ -65,20 +63,27 @@ def control_groups(controller: str, process: int | str = "self", root: str = "/"
         group = groups.get(mount.kind, "")
         if not group or (mount.kind == "cgroup" and controller not in mount.options):
             continue
-        is_inside = f"{group}/".startswith(f"{mount.root.rstrip('/')}/")
-        top = Path(root, mount.point.lstrip("/"))
-        place = top / os.path.relpath(group, mount.root) if is_inside else top
-        yield [place, *(above for above in place.parents if above.is_relative_to(top))]
+        top = root.rstrip("/") + mount.point
+        is_seen = _is_in(group, mount.root) and "/../" not in f"{group}/"  # not outside of our namespace
+        places = [os.path.normpath(f"{top}/{os.path.relpath(group, mount.root)}") if is_seen else top]
+        while places[-1] != top:
+            places.append(os.path.dirname(places[-1]))
+        yield places
 
 
-def group_values(groups: list[Path], name: str) -> list[int]:
+def group_values(groups: list[str], name: str) -> list[int]:
     """Return the numbers in a file of control groups, without those where it is missing or ``max``."""
-    return [int(line) for group in groups for line in _lines(group / name) if line.isdecimal()]
+    return [int(line) for group in groups for line in _lines(f"{group}/{name}") if line.isdecimal()]
 
 
-def _lines(path: Path) -> list[str]:
+def _is_in(path: str, directory: str) -> bool:
+    return f"{path}/".startswith(f"{directory.rstrip('/')}/")
+
+
+def _lines(path: str) -> list[str]:
     """Return the lines of a file; none if it cannot be read."""
     try:
-        return path.read_text(encoding="utf-8", errors="surrogateescape").splitlines()
+        with open(path, encoding="utf-8", errors="surrogateescape") as file:
+            return file.read().splitlines()
     except OSError:
         return []

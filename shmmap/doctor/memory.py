@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
 import stat
@@ -102,7 +101,7 @@ def check_memory_limit(diagnosis: Diagnosis) -> Finding:
         return fail(fact, f"{kills} {format_bytes(room)}, or raise MemoryMax=")
     if diagnosis.alive:
         private = max(
-            _private_bytes(groups[0] / "memory.stat") for groups in control_groups("memory", process, root)
+            _private_bytes(f"{groups[0]}/memory.stat") for groups in control_groups("memory", process, root)
         )
         fact += f", and its processes use {format_bytes(private)}"
         if budget + private > limit:
@@ -111,10 +110,12 @@ def check_memory_limit(diagnosis: Diagnosis) -> Finding:
     return ok(fact)
 
 
-def _private_bytes(stat_file: Path) -> int:
+def _private_bytes(stat_file: str) -> int:
     """Return the bytes outside tmpfs in a ``memory.stat`` of either version of control groups."""
-    with contextlib.suppress(OSError):
-        used = dict(line.split()[:2] for line in stat_file.read_text(encoding="ascii").splitlines())
+    try:
+        used = dict(line.split()[:2] for line in Path(stat_file).read_text(encoding="ascii").splitlines())
+    except OSError:
+        return 0
     return sum(int(used.get(name, 0)) for name in ("anon", "rss", "kernel"))
 
 

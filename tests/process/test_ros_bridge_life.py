@@ -82,6 +82,37 @@ def test_clients_are_answered_again_by_the_next_bridge(
         assert from_message(client.call(area=area, cached_ids=ids)).ids == ids[1:2]
 
 
+ENDED_ANYWHERE = """
+import signal, sys
+from shmmap_clients.ros_bridge import cli
+from shmmap_clients.ros_bridge.node import RosBridge
+
+def end(frame, event, _):
+    callers = []
+    while frame is not None:
+        callers.append(frame.f_code)
+        frame = frame.f_back
+    is_handling = RosBridge.stop.__code__ in callers or any(one.co_name == "<lambda>" for one in callers)
+    if RosBridge.run.__code__ in callers and not is_handling:
+        signal.raise_signal(signal.SIGTERM)
+
+sys.setprofile(end)
+sys.exit(cli.main(sys.argv[1:]))
+"""
+
+
+def test_a_signal_may_come_at_any_place(served: DaemonProcess, dds: int) -> None:
+    """Here at each call of the thread that waits for it: no lock may be taken twice."""
+    done = subprocess.run(
+        [sys.executable, "-c", ENDED_ANYWHERE, "--endpoint", served.endpoint, "--domain", str(dds)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        env=bridge_environment(),
+    )
+    assert (done.returncode, "ready:" in done.stderr) == (0, True), done.stderr
+
+
 def test_one_bridge_a_domain(bridge: BridgeProcess, served: DaemonProcess, dds: int) -> None:
     words = [*PROGRAM, "--endpoint", served.endpoint, "--domain", str(dds)]
     done = subprocess.run(words, capture_output=True, text=True, timeout=60, env=bridge_environment())

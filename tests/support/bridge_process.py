@@ -112,9 +112,11 @@ class BridgeProcess:
 
     def _wait(self) -> int:
         assert self.process is not None
-        code = self.process.wait(WITHIN_S)
-        self._listener.join()
-        return code
+        try:
+            return self.process.wait(WITHIN_S)
+        finally:
+            self.process.kill()  # one that does not end would answer the clients of later tests
+            self._listener.join()
 
     def _listen(self, process: subprocess.Popen[str]) -> None:
         assert process.stderr is not None

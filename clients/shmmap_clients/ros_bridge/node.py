@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from queue import SimpleQueue
 from types import TracebackType
 from typing import Final, TypeVar
 
@@ -134,6 +135,7 @@ class RosBridge:
         self._settings = settings
         self._log = log
         self._stop = threading.Event()
+        self._ended: SimpleQueue[None] = SimpleQueue()  # an event's lock may be held where a signal arrives
         self._ids = 0
         self._id = secrets.token_bytes(12)
         self._incompatible = _IncompatiblePeers(log)
@@ -189,7 +191,7 @@ class RosBridge:
 
     def stop(self) -> None:
         """End `run`; may be called from a signal handler."""
-        self._stop.set()
+        self._ended.put(None)
 
     def run(self) -> None:
         """Serve until `stop` is called."""
@@ -199,9 +201,9 @@ class RosBridge:
                 *(threads.submit(one.run) for one in self._workers),
             ]
             for one in runs:
-                one.add_done_callback(lambda _: self._stop.set())
+                one.add_done_callback(lambda _: self.stop())
             try:
-                self._stop.wait()
+                self._ended.get()
             finally:
                 self._stop.set()
                 for listening in self._all_listening:

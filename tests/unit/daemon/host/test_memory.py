@@ -175,6 +175,12 @@ def test_inside_a_container(tmp_path: Path) -> None:
     assert memory_limit_bytes(root=tree(tmp_path, "4:memory:/docker/1234\n", mounts, limits)) == 5000
 
 
+@pytest.mark.parametrize("group", ["/../b.service", "/.."])
+def test_a_group_outside_of_the_namespace(tmp_path: Path, group: str) -> None:
+    limits = {"cg/memory.max": "5000", "b.service/memory.max": "1"}
+    assert memory_limit_bytes(root=tree(tmp_path, f"0::{group}\n", V2, limits)) == 5000
+
+
 def test_nothing_there(tmp_path: Path) -> None:
     assert memory_limit_bytes(root=str(tmp_path)) is None
 
