@@ -26,6 +26,7 @@ from tests.support.segments import (
     damage_header,
     damage_payload,
     damage_publish_block,
+    other_builder,
     other_layout,
     punch,
     shorten,
@@ -134,7 +135,16 @@ def open_to_others(path: str) -> None:
 
 @pytest.mark.parametrize(
     "damage",
-    [damage_payload, damage_header, other_layout, damage_publish_block, shorten, punch, open_to_others],
+    [
+        damage_payload,
+        damage_header,
+        other_layout,
+        other_builder,
+        damage_publish_block,
+        shorten,
+        punch,
+        open_to_others,
+    ],
 )
 def test_a_damaged_leftover_is_never_served(
     served: DaemonProcess, client: RawClient, divided_map: DividedMap, damage: Callable[[str], None]

@@ -95,10 +95,20 @@ def damage_header(path: str) -> None:
 
 def other_layout(path: str) -> None:
     """Another major layout version, checksum and all."""
+    _pack("<H", path, 8, 2)
+
+
+def other_builder(path: str) -> None:
+    """The layer as another version of its code makes it."""
+    _pack("<I", path, 168, 200)
+
+
+def _pack(code: str, path: str, at: int, value: int) -> None:
+    """Change a field of a header, and give it a right checksum."""
     os.chmod(path, 0o600)
     with open(path, "r+b") as file:
         page = bytearray(file.read(4096))
-        struct.pack_into("<H", page, 8, 2)
+        struct.pack_into(code, page, at, value)
         end = 4096 - 72
         struct.pack_into("<I", page, end, zlib.crc32(page[:end]))
         file.seek(0)
