@@ -66,7 +66,7 @@ def test_copies_of_what_is_written_are_whole(written: ChunkView, opened: int) ->
     seen: set[int] = set()
     assert written.bricks.size
     waiting, copies = Deadline(), 0
-    while waiting(copies < 3000 or len(seen) < 50):
+    while waiting(copies < 1000 or len(seen) < 50):
         copy = read_chunk(opened)
         if copy is None:
             continue

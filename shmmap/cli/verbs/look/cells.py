@@ -100,7 +100,6 @@ def run_ls(args: argparse.Namespace) -> int:
 
 
 def _list(args: argparse.Namespace) -> int:
-
     area = area_from(args)
     found, identity = snapshot(args)
     rows = found.cells

@@ -124,7 +124,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _prepare_map(args: argparse.Namespace) -> int:
-
     from shmmap.layers.spec import canonical_layers
     from shmmap.prepare.run import prepare_map
 
@@ -182,7 +181,6 @@ def _prepare_map(args: argparse.Namespace) -> int:
 
 
 def _prepare_slice(args: argparse.Namespace) -> int:
-
     store = store_at(args.map_path, args)
     from shmmap.publishing.messages import SliceSettings
     from shmmap.publishing.slicing import prepare_slice

@@ -138,7 +138,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _join(args: argparse.Namespace) -> int:
-
     if args.url is not None:
         raise BadRequest("--join takes no MAP", hint="shmmap publish URL --join RUN")
     refuse_map_options(args, "--join: its slices say all that", ("layer", "id_prefix", "encoding", "resend"))
@@ -187,7 +186,6 @@ def _join(args: argparse.Namespace) -> int:
 
 
 def _publish(args: argparse.Namespace) -> int:
-
     from shmmap.layers.spec import canonical_layers
 
     store = store_at(args.url, args)
