@@ -94,7 +94,7 @@ def crashing(
         one: DaemonProcess = daemon(divided_map.root, "--workers", "1", start=False, shm_dir=shm_dir)
         if label in STEPS_AT_START:
             one.start()
-            with shmmap.connect(one.endpoint) as client:
+            with shmmap.connect(one.endpoint, timeout=60.0) as client:
                 client.around(0, 0, 60).raise_for_failures()
             one.kill()
         one.environment[CRASH] = f"{label}:1:{tmp_path}/reached"
@@ -153,7 +153,7 @@ def test_daemon_and_worker(
             live(client, divided_map)
             assert reader.checksums() == before
         assert keeper.restarts == label.startswith("daemon.")
-    with shmmap.connect(one.endpoint) as client:
+    with shmmap.connect(one.endpoint, timeout=60.0) as client:
         assert_right(whole(client, 0, 0, 500), divided_map, sorted(divided_map.corners))
         until(lambda: _books_agree(one, client))
         client.evict()
@@ -202,7 +202,7 @@ def test_client(
     if label == "client.answer":
         number = 1
     one = daemon(divided_map.root)
-    with shmmap.connect(one.endpoint) as other:
+    with shmmap.connect(one.endpoint, timeout=60.0) as other:
         near = divided_map.in_circle(0, 0, 30)
         held = whole(other, 0, 0, 5)
         assert die(request, one.endpoint, f"{label}:{number}") == -9

@@ -45,7 +45,9 @@ def connect(path: Path | str) -> None:
     shmmap.connect(path, connect_timeout=SOON_S).close()
 
 
-def test_candidates_in_order() -> None:
+def test_candidates_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    own = tmp_path / "shmmap-7"  # this user may have one in /tmp
+    monkeypatch.setattr("shmmap.protocol.endpoint.fallback_runtime_dir", lambda: str(own))
     environ = {"XDG_RUNTIME_DIR": "/run/user/7"}
     assert candidates(None, environ) == ["/run/user/7/shmmap/default.sock", "/run/shmmap/default.sock"]
     assert candidates(None, {}) == ["/run/shmmap/default.sock"]
@@ -54,6 +56,8 @@ def test_candidates_in_order() -> None:
     assert candidates(None, named) == ["/run/user/7/shmmap/town.sock", "/run/shmmap/town.sock"]
     assert candidates(None, {**named, "SHMMAP_RUNTIME_DIR": "/r"}) == ["/r/town.sock"]
     assert candidates("/c.sock", {"SHMMAP_ENDPOINT": "/a/b.sock"}) == ["/c.sock"]
+    own.mkdir(mode=0o700)
+    assert candidates(None, {}) == [f"{own}/default.sock", "/run/shmmap/default.sock"]
     with pytest.raises(BadRequest, match="tcp"):
         candidates("tcp://host:1", {})
     with pytest.raises(BadRequest, match="107"):
