@@ -40,7 +40,8 @@ def mounts(root: str = "/") -> Iterator[Mount]:
 
 def mount_of(path: str, root: str = "/") -> Mount:
     """Return the mount that a path is on; of type ``unknown`` if the mounts cannot be read."""
-    around = [mount for mount in mounts(root) if _is_in(os.path.realpath(path), mount.point)]
+    place = os.path.realpath(path)
+    around = [mount for mount in mounts(root) if _is_in(place, mount.point)]
     return max(reversed(around), key=lambda mount: len(mount.point), default=Mount("unknown", "/", "/", []))
 
 

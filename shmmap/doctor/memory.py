@@ -100,9 +100,8 @@ def check_memory_limit(diagnosis: Diagnosis) -> Finding:
     if budget > room:
         return fail(fact, f"{kills} {format_bytes(room)}, or raise MemoryMax=")
     if diagnosis.alive:
-        private = max(
-            _private_bytes(f"{groups[0]}/memory.stat") for groups in control_groups("memory", process, root)
-        )
+        groups = control_groups("memory", process, root)
+        private = max((_private_bytes(f"{one[0]}/memory.stat") for one in groups), default=0)
         fact += f", and its processes use {format_bytes(private)}"
         if budget + private > limit:
             left = format_bytes(max(limit - private, 1 << 20))

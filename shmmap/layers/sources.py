@@ -35,6 +35,7 @@ __all__ = [
     "Files",
     "Neighbour",
     "SourceReader",
+    "check_size",
     "read_segment",
     "read_source",
 ]
@@ -87,7 +88,7 @@ def read_source(path: str, box: Box, needs: Sequence[str] | None) -> CellSource:
         The file cannot be read, is too large (cause ``too_large``), or changed meanwhile (``changed``).
     """
     with PcdReader(path) as reader:
-        _check_size(reader.header.points * reader.header.point_bytes, path)
+        check_size(reader.header.points * reader.header.point_bytes, path)
         stamp = SourceStamp.of(os.fstat(reader.fileno()))
         wanted = [i for i, spec in enumerate(reader.columns) if needs is None or spec.name in needs]
         specs = [reader.columns[i] for i in wanted]
@@ -136,7 +137,7 @@ def read_segment(fd: int, box: Box, needs: Sequence[str] | None) -> CellSource:
         The segment cannot be read.
     """
     header, _ = read_header(fd)
-    _check_size(sum(column.nbytes for column in header.columns), header.cell_id)
+    check_size(sum(column.nbytes for column in header.columns), header.cell_id)
     columns: dict[str, NDArray[Any]] = {}
     for column in header.columns:
         if needs is None or column.name in needs:
@@ -152,7 +153,8 @@ def read_segment(fd: int, box: Box, needs: Sequence[str] | None) -> CellSource:
     return CellSource.of(header, columns, box)
 
 
-def _check_size(nbytes: int, name: str) -> None:
+def check_size(nbytes: int, name: str) -> None:
+    """Raise MapDataError (cause ``too_large``) for more points than a layer is computed of."""
     if nbytes > MAX_SOURCE_BYTES:
         raise refusal(
             "too_large",

@@ -23,7 +23,7 @@ from shmmap.layers.build import cache_key
 from shmmap.layers.contract import Box
 from shmmap.layers.disk_cache import LayerCache
 from shmmap.layers.points import LAYER
-from shmmap.layers.sources import CellJob, CellSource
+from shmmap.layers.sources import CellJob, CellSource, check_size
 from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.origin.remote.object_tier import KeptObjects, ObjectTier
 from shmmap.origin.remote.published_object import (
@@ -95,6 +95,7 @@ class PublishedPoints:
         try:
             unpacked = unpack_frame(self._frame(name), name.raw, name=path, exact=True)
             header, columns = read_points(unpacked, source, needs, name=path)
+            check_size(sum(column.nbytes for column in header.columns), source.name)
         except MapDataError as error:
             raise LoadFailed(str(error), cell_id=source.name) from None
         return CellSource.of(header, columns, box)

@@ -356,16 +356,19 @@ def read_points(
     Errors are those of `write_segment`.
     """
     stamp = stamp_of(source)
+    bare = read_bare_header(unpacked, POINTS, name=name)
+    columns = {
+        column.name: rows_of(unpacked, column)
+        for column in bare.columns
+        if needs is None or column.name in needs
+    }
+    is_rounded = _mm_origin(unpacked) is not None
     header = msgspec.structs.replace(
-        read_bare_header(unpacked, POINTS, name=name),
+        bare,
+        columns=tuple(_decoded(column) for column in bare.columns) if is_rounded else bare.columns,
         source=SourceStamp.from_token(stamp),
         source_digest=stamp[:16],
     )
-    columns = {
-        column.name: rows_of(unpacked, column)
-        for column in header.columns
-        if needs is None or column.name in needs
-    }
     return header, columns
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -70,6 +71,20 @@ def cells_of(store: Store) -> dict[str, tuple[Source, tuple[float, float, float,
             source = pack_source(shard.id(row, root.id_prefix), {"points": layer})
             found[name.decode()] = source, shard.box(row), layer.size
     return found
+
+
+@pytest.mark.parametrize("too_few", [0, 1])
+def test_cells_of_too_many_points_are_refused(
+    store: Store, monkeypatch: pytest.MonkeyPatch, too_few: int
+) -> None:
+    """By the size of their points in memory, as cells of files are."""
+    source, box, _ = next(iter(cells_of(store).values()))
+    with ThreadPoolExecutor(2) as threads:
+        points = PublishedPoints(KeptObjects(store, None), threads)
+        nbytes = sum(column.nbytes for column in points.read(source, box, None).points.columns.values())
+        monkeypatch.setattr("shmmap.layers.sources.MAX_SOURCE_BYTES", nbytes - too_few)
+        with pytest.raises(LoadFailed, match="a layer is computed of at most") if too_few else nullcontext():
+            points.read(source, box, None)
 
 
 def test_points_are_those_of_the_file(store: Store, town: DividedMap) -> None:
