@@ -16,6 +16,7 @@ from shmmap.protocol.messages import Handle, Reply, Request
 __all__ = [
     "MAX_REQUEST_BYTES",
     "PackedArray",
+    "check_packed",
     "decode_reply",
     "decode_request",
     "encode",
@@ -155,10 +156,15 @@ def pack_versions(versions: Iterable[int]) -> bytes:
 
 
 def unpack_versions(packed: bytes) -> tuple[int, ...]:
-    """Return packed cell versions; raise `BadRequest` if their size is no multiple of 8 bytes."""
+    """Return packed cell versions; errors as of `check_packed`."""
+    check_packed(packed)
+    return struct.unpack(f"<{len(packed) // 8}Q", packed)
+
+
+def check_packed(packed: bytes) -> None:
+    """Raise `BadRequest` if the size of packed cell versions is no multiple of 8 bytes."""
     if len(packed) % 8:
         raise BadRequest(f"packed versions of {len(packed)} bytes are no multiple of 8")
-    return struct.unpack(f"<{len(packed) // 8}Q", packed)
 
 
 def decode_reply(data: bytes | memoryview) -> Reply:

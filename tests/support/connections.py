@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from types import SimpleNamespace
 from typing import cast
 
@@ -25,13 +25,15 @@ def says(session: Session, intent: Intent, now_s: float) -> None:
 
 
 class Subscriber:
-    """A subscriber of an event log that keeps all events."""
+    """A subscriber of an event log that keeps all events; ``reads``: whether it takes what it is offered."""
 
     def __init__(self) -> None:
         self.events: list[Event] = []
+        self.reads = True
 
-    def offer(self, body: bytes, _max_unread_bytes: int) -> None:
-        self.events.append(cast("Event", decode_event(body)))
+    def offer(self, bodies: Iterable[bytes]) -> bool:
+        self.events += [cast("Event", decode_event(body)) for body in bodies]
+        return self.reads
 
     def take(self) -> list[Event]:
         """Return the events since the last call."""

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Numbered events of this run of the daemon: the latest ones are stored, and all are sent to subscribers.
 
-Events are sent over an XPUB socket next to the request socket.  A subscriber that is too slow loses events,
-and notices by their numbers; the log waits for no subscriber.
+Events are sent over an XPUB socket next to the request socket.  The log waits for no subscriber and keeps
+nothing for one: a slow subscriber gets the stored events when it reads again.  Those that are forgotten by
+then it loses, and notices by their numbers.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import itertools
 import socket
 import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Final, Protocol
 
 import msgspec
@@ -26,11 +27,11 @@ from shmmap.statistics.writer import StatisticsWriter
 __all__ = ["EventLog", "MinuteLog", "event_listener", "events_path"]
 
 REMEMBERED: Final = 4096
-"""Events stored for later requests: less than a megabyte."""
+"""Events stored for later requests and slow subscribers: less than a megabyte."""
 PAGE_EVENTS: Final = 500
 LOG_S: Final = 60.0
-MAX_UNREAD_BYTES: Final = 1 << 20
-"""Limit of unread events of a subscriber; at the limit it loses further ones."""
+SENT_TOGETHER: Final = 64
+"""Events sent to a slow subscriber at once; what it does not read of them is all that is kept for it."""
 MAX_SUBSCRIPTION_BYTES: Final = 64
 _NAMED: Final = 3
 _SUBSCRIBE: Final = b"\x01"  # followed by a prefix
@@ -39,8 +40,8 @@ _SUBSCRIBE: Final = b"\x01"  # followed by a prefix
 class Subscriber(Protocol):
     """A receiver of all events."""
 
-    def offer(self, body: bytes, max_unread_bytes: int, /) -> None:
-        """Send a message, unless ``max_unread_bytes`` are unread already."""
+    def offer(self, bodies: Iterable[bytes], /) -> bool:
+        """Send messages, unless earlier ones are unread; return whether these have been taken whole."""
 
 
 class EventLog:
@@ -64,20 +65,38 @@ class EventLog:
         self.last = 0
         self._clock_ns = clock_ns
         self._kept: deque[tuple[int, bytes]] = deque(maxlen=REMEMBERED)  # (unix_ns, event)
-        self._subscribers: dict[Subscriber, None] = {}
+        self._subscribers: dict[Subscriber, None] = {}  # that have read all
+        self._slow: dict[Subscriber, int] = {}  # the others, with the number of the event to send next
 
     def subscribe(self, subscriber: Subscriber) -> None:
         """Send all events to a subscriber from now on, beginning with the number of the last event."""
-        self._subscribers[subscriber] = None
-        subscriber.offer(self._event(events.Beat), MAX_UNREAD_BYTES)
+        self.unsubscribe(subscriber)
+        self._send_to([subscriber], self._event(events.Beat))
 
     def unsubscribe(self, subscriber: Subscriber) -> None:
         """Stop sending events to a subscriber."""
         self._subscribers.pop(subscriber, None)
+        self._slow.pop(subscriber, None)
+
+    def resume(self, subscriber: Subscriber) -> None:
+        """Send a slow subscriber the stored events that it lacks: it has read all that was sent."""
+        number = self._slow.pop(subscriber, None)
+        if number is None:
+            return
+        first = self.last - len(self._kept) + 1
+        number = max(number, first)
+        while number <= self.last:
+            some = list(itertools.islice(self._kept, number - first, number - first + SENT_TOGETHER))
+            number += len(some)
+            if not subscriber.offer(data for _at_ns, data in some):
+                self._slow[subscriber] = number
+                return
+        self._subscribers[subscriber] = None
 
     def close(self) -> None:
         """Stop sending events."""
         self._subscribers.clear()
+        self._slow.clear()
 
     def publish(self, kind: Callable[..., events.Event], *fields: object) -> None:
         """Send an event made of ``kind`` and its own fields, with the next number, and store it."""
@@ -85,11 +104,11 @@ class EventLog:
         now_ns = self._clock_ns()
         data = encode_event(kind(self.last, self.epoch, now_ns, *fields))
         self._kept.append((now_ns, data))
-        self._send(data)
+        self._send_to(list(self._subscribers), data)
 
     def mention(self, kind: Callable[..., events.Event], *fields: object) -> None:
-        """Send an event without a number, which is not stored."""
-        self._send(self._event(kind, *fields))
+        """Send an event without a number, which is not stored; slow subscribers do not get it."""
+        self._send_to(list(self._subscribers), self._event(kind, *fields))
 
     def beat(self) -> None:
         """Send the number of the last event."""
@@ -98,9 +117,13 @@ class EventLog:
     def _event(self, kind: Callable[..., events.Event], *fields: object) -> bytes:
         return encode_event(kind(self.last, self.epoch, self._clock_ns(), *fields))
 
-    def _send(self, data: bytes) -> None:
-        for one in self._subscribers:
-            one.offer(data, MAX_UNREAD_BYTES)
+    def _send_to(self, subscribers: Iterable[Subscriber], data: bytes) -> None:
+        for one in subscribers:
+            if one.offer((data,)):
+                self._subscribers[one] = None
+            else:
+                self._subscribers.pop(one, None)
+                self._slow[one] = self.last + 1
 
     def page(self, message: Recent) -> EventPage:
         """Return past events in answer to a request."""
@@ -146,6 +169,7 @@ def event_listener(
         MAX_SUBSCRIPTION_BYTES,
         on_message,
         event_log.unsubscribe,
+        event_log.resume,
     )
 
 

@@ -19,8 +19,8 @@ import socket
 import struct
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
 from typing import Final, TypeAlias
 
 from shmmap.daemon.transport.zmtp import GREETING, Incoming, framed, framed_in_parts
@@ -119,10 +119,14 @@ class Connection:
         self._listener.statistics.add("errors_returned")
         self.reply(encode(ErrorReply(request, error.code, error.message, error.hint)))
 
-    def offer(self, body: bytes, max_unread_bytes: int) -> None:
-        """Send a message, or drop it if more than ``max_unread_bytes`` are unread already."""
-        if self.unsent_bytes <= max_unread_bytes:
-            self._send(framed(body))
+    def offer(self, bodies: Iterable[bytes]) -> bool:
+        """Send messages unless earlier bytes are unread; return whether the kernel has taken them whole.
+
+        If it has not, the listener's ``on_read`` is called when the client has read what was sent.
+        """
+        if not self._unsent:
+            self._send(b"".join(map(framed, bodies)))
+        return not self._unsent
 
     def cut(self, reason: str = "") -> None:
         """Mark the connection to be closed by the loop, which may be using it; log the reason if given."""
@@ -223,6 +227,8 @@ class Connection:
             return
         if self._unsent:
             self._flush()
+            if not self._unsent:
+                self._listener.on_read(self)
         if not self._reading or not self._incoming.more:
             try:
                 data = self._socket.recv(READ_BYTES, 0 if self._reading else socket.MSG_PEEK)
@@ -347,6 +353,8 @@ class Listener:
         Called with a message's connection, its first frame, and whether it had more frames.
     on_disconnect
         Called with a connection that was closed.
+    on_read
+        Called with a connection whose client had left something unread, and has read it all.
     """
 
     socket: Socket
@@ -358,6 +366,7 @@ class Listener:
     max_bytes: int
     on_message: Callable[[Connection, bytes, bool], None]
     on_disconnect: Callable[[Connection], None]
+    on_read: Callable[[Connection], None] = field(default=lambda _connection: None)
 
     def move_to(self, other: Socket) -> None:
         """Listen at another socket; connections stay, and pending ones are accepted."""

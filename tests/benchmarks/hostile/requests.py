@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 import struct
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final
 
@@ -232,3 +233,40 @@ def bomb(report: Report, stage: Stage) -> None:
                 f"{layer} at x = {x:g}: {time.monotonic() - begin_s:.1f} s, {len(reply[4])} cells, {failed}"
             )
             report.limit("private memory of a loader", peak / (1 << 20), LOADER_MIB, "MiB")
+
+
+HELD: Final = 100_000
+"""As many as one request may name."""
+
+
+def holds_very_many(orders: Orders, endpoint: str, known: bool) -> dict[str, int]:
+    """Ask for what changed around a place, and name 100 000 held versions; ``known``: also the map's."""
+    found = {"requests": 0, "reply_bytes": 0}
+    with RawClient(endpoint, name="holds", timeout=REPLY_S) as client:
+        versions = [cell.version for cell in client.area(EVERYTHING, wait=60.0).cells] if known else []
+        packed = b"".join(struct.pack("<Q", version) for version in versions) + os.urandom(
+            8 * (HELD - len(versions))
+        )
+        request = pack(["differential", 1, circle(0, 0, 30.0), ["points"], [], packed, None, None])
+        orders.say("begins")
+        while orders.go_on():
+            client.send_bytes(request)
+            reply = client.receive_bytes()
+            found["requests"] += 1
+            found["reply_bytes"] = len(reply)
+    return found
+
+
+@scene("A24", "Differentials that name very many versions delay no one")
+def versions_held(report: Report, stage: Stage) -> None:
+    """Four clients, one request after the other, with 100 000 packed versions each, for 20 s."""
+    with stage.served(stage.many_cells(SIDE), "--budget", "1G") as one, ExitStack() as stack:
+        attackers = [
+            stack.enter_context(Actor(holds_very_many, one.endpoint, number % 2 == 1)) for number in range(4)
+        ]
+        for attacker in attackers:
+            attacker.said(600.0)
+        with Beside(report, one):
+            time.sleep(20.0)
+        for attacker in attackers:
+            report.note(f"differentials of {HELD} versions: {attacker.end()}")

@@ -9,6 +9,7 @@ import gc
 import math
 import os
 import random
+import select
 import signal
 import socket
 import struct
@@ -16,6 +17,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Final
 
@@ -23,7 +25,8 @@ import zmq
 
 import shmmap
 from tests.benchmarks.hostile.actors import Actor, Orders, walks_cold
-from tests.benchmarks.hostile.beside import Beside
+from tests.benchmarks.hostile.beside import Beside, private_bytes
+from tests.benchmarks.hostile.segments import budget_for
 from tests.benchmarks.hostile.stage import Report, Stage, scene
 from tests.support.daemon_process import ROOT
 from tests.support.message_pack import pack
@@ -301,3 +304,52 @@ def boot(report: Report, stage: Stage) -> None:
             )
             if failed:
                 report.note(f"one got: {failed[0].strip().splitlines()[-1][:160]}")
+
+
+UNREAD: Final = 200
+MEMORY_BACK_S: Final = 10.0
+"""Within this time the daemon's memory is what it was, after the subscribers have ended."""
+
+
+def subscribes_without_reading(orders: Orders, path: str, count: int) -> int:
+    """Subscribe ``count`` times and never read; connect again when ended."""
+    waiting: list[PlainClient] = []
+    made = 0
+    while orders.go_on(0.2):
+        ends = select.poll()
+        for one in waiting:
+            ends.register(one.connection, 0)
+        ended = {fd for fd, _hung_up in ends.poll(0)}
+        waiting = [one for one in waiting if one.connection.fileno() not in ended]
+        while len(waiting) < count:
+            one = PlainClient(path, ready="ready of a SUB", timeout_s=10.0)
+            one.connection.sendall(b"\x00\x01\x01")
+            waiting.append(one)
+            made += 1
+        if made == count:
+            orders.say(made)
+    return made
+
+
+@scene("A23", "Subscribers that never read delay no one, and their memory comes back")
+def unread_events(report: Report, stage: Stage) -> None:
+    """200 subscribers that never read, beside a client whose walk evicts hundreds of cells a second, 30 s."""
+    side, segments = 141, 2000
+    with ExitStack() as stack:
+        one = stack.enter_context(stage.served(stage.many_cells(side), "--budget", budget_for(segments)))
+        with RawClient(one.endpoint, hello=False) as client:
+            events_path = client.hello()[19]
+        before = private_bytes(one.pid)
+        with Beside(report, one):
+            with (
+                Actor(subscribes_without_reading, events_path, UNREAD) as attacker,
+                Actor(walks_cold, one.endpoint, 30.0, (0.0, side * 20.0), (60.0, side * 20.0)) as walker,
+            ):
+                loaded, took_s = walker.said(900.0)
+                made = attacker.end()
+            report.note(f"{loaded} cells loaded in {took_s:.0f} s; subscriptions made: {made}")
+        end_s = time.monotonic() + MEMORY_BACK_S
+        while private_bytes(one.pid) > before + (16 << 20) and time.monotonic() < end_s:
+            time.sleep(0.2)
+        grown = (private_bytes(one.pid) - before) / (1 << 20)
+        report.limit(f"memory {MEMORY_BACK_S:g} s after their end, over what it was", grown, 16.0, "MiB")

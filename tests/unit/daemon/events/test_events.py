@@ -19,7 +19,7 @@ from shmmap.daemon.events.cell_events import (
     PrefetchMisses,
     PressureEvents,
 )
-from shmmap.daemon.events.log import REMEMBERED, EventLog, MinuteLog
+from shmmap.daemon.events.log import REMEMBERED, SENT_TOGETHER, EventLog, MinuteLog
 from shmmap.daemon.live.relay import LiveEvents
 from shmmap.daemon.records import Key
 from shmmap.daemon.transport.sessions import Session, Sessions
@@ -81,6 +81,35 @@ def test_the_oldest_are_forgotten() -> None:
     page = log.page(e.Recent(1, limit=1 << 30))
     assert (page.first, page.next) == (11, REMEMBERED + 11)
     assert numbers(page) == list(range(11, 511))  # a page is never longer, whatever is asked for
+
+
+def test_a_slow_subscriber_gets_what_is_stored_when_it_reads_again() -> None:
+    """Nothing is kept for it; what is forgotten by then it loses, and the numbers show it."""
+    log, slow = subscribed()
+    other = Subscriber()
+    log.subscribe(other)
+    slow.reads = False
+    for _ in range(100):
+        log.publish(e.Changed, "a.pcd", 1, "changed")
+    log.beat()
+    assert [event.seq for event in slow.take()] == [1], "what it did not read; then nothing more"
+    assert [event.seq for event in other.take()] == [0, *range(1, 101), 100]
+    log.resume(slow)
+    assert [event.seq for event in slow.take()] == [*range(2, 2 + SENT_TOGETHER)], "and it does not read them"
+    for _ in range(REMEMBERED):
+        log.publish(e.Changed, "a.pcd", 1, "changed")
+    slow.reads = True
+    log.resume(slow)
+    assert [event.seq for event in slow.take()] == [*range(101, REMEMBERED + 101)]
+    log.resume(slow)
+    log.publish(e.Changed, "a.pcd", 1, "changed")
+    assert [event.seq for event in slow.take()] == [REMEMBERED + 101]
+    slow.reads = False
+    log.beat()
+    log.unsubscribe(slow)
+    log.resume(slow)
+    log.publish(e.Changed, "a.pcd", 1, "changed")
+    assert [event.seq for event in slow.take()] == [REMEMBERED + 101]
 
 
 def test_pressure_is_published_once_a_second() -> None:

@@ -17,6 +17,7 @@ from typing import Any, cast
 import pytest
 import zmq
 
+from shmmap.daemon.events.log import REMEMBERED, EventLog
 from shmmap.daemon.transport.connection import (
     FRAMES_PER_TURN,
     MAX_UNREAD_BYTES,
@@ -35,6 +36,7 @@ from shmmap.daemon.transport.zmtp import GREETING, framed
 from shmmap.daemon.turns import WatchedDescriptors
 from shmmap.errors import Busy
 from shmmap.protocol.codec import decode_reply
+from shmmap.protocol.events import Changed, decode_event
 from shmmap.statistics.writer import StatisticsWriter
 from tests.support.daemon_process import Deadline
 
@@ -259,6 +261,32 @@ def test_replies_that_are_not_read(loop: Loop) -> None:
     loop.settle()
     assert loop.ended == [connection]
     assert (loop.count, loop.connections.nbytes) == (0, 0)
+
+
+def test_subscribers_that_do_not_read(loop: Loop) -> None:
+    """Whatever is published, a few messages are kept for each; who reads again misses nothing."""
+    log = EventLog(7)
+    loop.listener.on_read = log.resume
+    unread = [loop.raw(GREETING + READY) for _ in range(20)]
+    for connection in loop.connections:
+        log.subscribe(connection)
+    for number in range(REMEMBERED):
+        log.publish(Changed, f"{number}.pcd", number, "changed")
+    assert all(0 < one.unsent_bytes < 1 << 14 for one in loop.connections)
+    assert loop.connections.nbytes < 20 << 14
+    received, at = bytearray(), len(GREETING)
+    numbers: list[int] = []
+    waiting = Deadline()
+    while waiting(REMEMBERED not in numbers[-1:]):
+        received += unread[0].recv(1 << 20)
+        loop.settle()
+        while at + 1 < len(received) and (end := at + 2 + received[at + 1]) <= len(received):
+            if not received[at]:  # a message; a command has flags
+                event = decode_event(bytes(received[at + 2 : end]))
+                assert event is not None
+                numbers.append(event.seq)
+            at = end
+    assert numbers == [*range(REMEMBERED + 1)], "the first is the beat of its subscription"
 
 
 def test_half_a_message_from_each(loop: Loop, other: int) -> None:
