@@ -24,6 +24,7 @@ import numba.core.serialize
 from numba.core.caching import NullCache
 from numba.core.typeinfer import register_dispatcher
 
+from shmmap.compile_notices import notice
 from shmmap.kernel_cache import discard, read_kernel, write_kernel
 from shmmap.version import __version__
 
@@ -53,19 +54,22 @@ class _KernelFiles(NullCache):
         self._made_from = _dumps((_VERSIONS, source, code.co_code, closure))
         self._stem = f"{Path(code.co_filename).stem}.{function.__name__}-{code.co_firstlineno}"
         self._where = f"{code.co_filename} {function.__qualname__} {sys.implementation.cache_tag}"
+        lines = source.splitlines()
+        self._module = function.__module__
+        self._number, self._of = _count(lines[: code.co_firstlineno]), _count(lines)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Return the compiled variant for a signature; None if it has to be compiled."""
         target_context.refresh()
         name = self._name(sig, target_context.codegen())
         data = read_kernel(name, self._made_from)
-        if data is None:
-            return None
-        try:
-            return _CompileResult._rebuild(target_context, *pickle.loads(data))  # noqa: S301  its owner was checked
-        except Exception as error:  # noqa: BLE001  after any error the kernel can be compiled
-            discard(name, error)
-            return None
+        if data is not None:
+            try:
+                return _CompileResult._rebuild(target_context, *pickle.loads(data))  # noqa: S301  its owner was checked
+            except Exception as error:  # noqa: BLE001  after any error the kernel can be compiled
+                discard(name, error)
+        notice(self._module, self._number, self._of)
+        return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Store a variant, unless it is bound to this process."""
@@ -76,6 +80,11 @@ class _KernelFiles(NullCache):
         """Return a file's name, unique for the signature, the processor and the source's path."""
         key = f"{self._where} {signature} {codegen.magic_tuple()}"
         return f"{self._stem}.{hashlib.sha256(key.encode()).hexdigest()[:16]}.kernel"
+
+
+def _count(lines: list[bytes]) -> int:
+    """Return the number of kernels in some lines of a module."""
+    return sum(line.startswith(b"@compiled(") for line in lines)
 
 
 def read_only(dtype: Any, dimensions: int) -> Any:

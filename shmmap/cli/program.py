@@ -14,6 +14,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, Final, NoReturn
 
+from shmmap.cli.compiling_lines import CompilingLines
+from shmmap.compile_notices import watch
 from shmmap.errors import CannotWrite, InternalError, ShmmapError
 from shmmap.formats.durable_file import writing_errors
 
@@ -113,6 +115,7 @@ def exit_code_of(name: str, run: Callable[[], int]) -> int:
     """Run a program and return its exit code; print its errors on stderr."""
     _open_what_is_closed()
     keep_interrupts()
+    watch(CompilingLines(name))
     try:
         code = run()
         sys.stdout.flush()

@@ -117,6 +117,7 @@ COUNTERS: Final = (
     Counter("loads_timed_out", "counter", "", "Loads stopped at their deadline"),
     Counter("bytes_loaded", "counter", "bytes", "Segment bytes published"),
     Counter("workers", "gauge", "", "Loader processes that are alive"),
+    Counter("loaders_compiling", "gauge", "", "Loader processes that compile kernels, once for each version"),
     Counter("worker_crashes", "counter", "", "Loader processes that ended unexpectedly"),
     Counter("load_queue", "gauge", "", "Loads waiting for a worker"),
     Counter("cells_resident", "gauge", "", "Segments that can be handed out"),

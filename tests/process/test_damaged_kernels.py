@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ import shmmap
 from shmmap import kernel_cache
 from shmmap.layers.build import compile_kernels
 from tests.process.conftest import DaemonFactory
+from tests.support.command_line import Shmmap
 from tests.support.daemon_process import DaemonProcess, until
 from tests.support.divided_map import DividedMap
 
@@ -126,10 +128,29 @@ def test_what_layers_need_is_compiled_once(
         assert found.cells
         assert not found.failed
     assert compiled(kernels) == made, "nothing was left to compile"
+    assert one.log.count("compiling kernels, once for this version") == 1
     other = daemon(divided_map.root, environment={"NUMBA_CACHE_DIR": str(kernels)})
     with shmmap.connect(other.endpoint) as client:
         assert client.around(0, 0, radius=5.0, wait=60.0).cells
     assert compiled(kernels) == made
+
+
+def test_who_waits_for_a_layer_learns_that_kernels_are_compiled(
+    daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path
+) -> None:
+    kernels = tmp_path / "kernels"
+    kernels.mkdir(mode=0o700)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("NUMBA_CACHE_DIR", str(kernels))
+        mark = kernel_cache.compiled_mark()
+    assert mark is not None
+    mark.touch()  # the daemon does not compile before it has to
+    one = daemon(divided_map.root, environment={"NUMBA_CACHE_DIR": str(kernels)})
+    query = partial(Shmmap(one, tmp_path).run, "query", "--circle", "0,0,5", "--layer", "ndt(leaf=2.0)")
+    line = "shmmap: the daemon compiles kernels for this layer, once for this version\n"
+    assert query("--wait", "300").stderr == line  # on a busy machine a load may have come to its deadline
+    until(lambda: not query("--wait", "300").returncode, lambda: one.log)
+    assert query("--wait", "300").stderr == ""
 
 
 def test_a_daemon_that_ends_meanwhile_leaves_nothing(

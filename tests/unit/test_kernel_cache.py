@@ -20,7 +20,8 @@ from typing import Any
 
 import pytest
 
-from shmmap import kernel_cache
+from shmmap import compile_notices, kernel_cache
+from shmmap.cli.compiling_lines import CompilingLines
 from shmmap.layers import build
 
 pytest.importorskip("numba", reason="needs the package numba")
@@ -80,6 +81,36 @@ def test_what_is_compiled_is_kept(kernel: Kernel, caplog: pytest.LogCaptureFixtu
     assert stat.S_IMODE(kernel.directory.stat().st_mode) == 0o700
     assert kernel_cache.all_kept()
     assert not warnings(caplog)
+
+
+def test_compiling_is_noticed_and_loading_is_not(
+    kernel: Kernel, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A program's lines: one at first, with how far it is; the next one seconds later."""
+    seen: list[tuple[str, int, int]] = []
+    lines = CompilingLines("shmmap-ndt")
+
+    def show(*notice: Any) -> None:
+        seen.append(notice)
+        lines(f"shmmap.{notice[0]}", *notice[1:])
+
+    monkeypatch.setattr(compile_notices, "_watchers", [])
+    compile_notices.watch(show)
+    kernel.module.write_text(SOURCE + SOURCE.partition("\n\n")[2].replace("doubled", "again"))
+    assert [kernel.hits(), kernel.hits()] == [0, 1]
+    assert seen == [("doubling", 1, 2), ("doubling", 2, 2)]
+    assert capsys.readouterr().err == (
+        "shmmap-ndt: compiling kernels, once for this version: doubling, 1 of 2\n"
+    )
+
+
+def test_the_first_is_logged(kernel: Kernel, caplog: pytest.LogCaptureFixture) -> None:
+    compile_notices._logged.clear()
+    with caplog.at_level(logging.INFO, "shmmap"):
+        kernel.hits()
+        kernel.module.write_text(SOURCE.replace("2 * value", "value + value"))
+        kernel.hits()
+    assert caplog.messages == ["compiling kernels, once for this version module=doubling kernels=1"]
 
 
 def test_another_source_is_another_kernel(kernel: Kernel, caplog: pytest.LogCaptureFixture) -> None:

@@ -24,6 +24,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final, NoReturn
 
+from shmmap.compile_notices import log_first, watch
 from shmmap.daemon.host.scheduling import take_slices
 from shmmap.daemon.loading import worker_messages
 from shmmap.daemon.loading.worker_main import WorkerSettings, limit_memory, work
@@ -55,6 +56,7 @@ def _run_child(parent: int, run: Callable[[], int]) -> NoReturn:
 def _compile() -> int:
     """Compile the kernels of layers, unless another daemon is doing so; return the exit code."""
     os.nice(_MAX_NICE)
+    watch(log_first)
     from shmmap.layers.build import compile_kernels
 
     with contextlib.suppress(MemoryError):

@@ -20,7 +20,18 @@ from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.loading.lost_workers import LostWorkers
 from shmmap.daemon.loading.prefetcher import Prefetcher
 from shmmap.daemon.loading.room import Room
-from shmmap.daemon.loading.worker_messages import Begun, Check, Checked, Done, Ended, Failed, Job, Need, Ready
+from shmmap.daemon.loading.worker_messages import (
+    Begun,
+    Check,
+    Checked,
+    Compiling,
+    Done,
+    Ended,
+    Failed,
+    Job,
+    Need,
+    Ready,
+)
 from shmmap.daemon.loading.worker_pool import NOT_OPENED, Opened, Worker, WorkerPool
 from shmmap.daemon.records import SPACE_CODES, Failure, Key, Load, Resident, failure_code
 from shmmap.failpoints import step
@@ -351,6 +362,8 @@ class Scheduler:
             self.lost.ended(worker, "too many open files", now_s)
         elif isinstance(message, Begun):
             self.pool.works_on(worker, message.number, now_s)
+        elif isinstance(message, Compiling):
+            worker.compiling = True
         elif isinstance(message, Need):
             self.room.ask(worker, message)
             self.room.grant(self._jobs, now_s)

@@ -21,6 +21,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, TypeAlias
 
+from shmmap.compile_notices import watch
 from shmmap.daemon.host.scheduling import weigh_less
 from shmmap.daemon.loading import worker_messages
 from shmmap.daemon.records import failure_code
@@ -137,6 +138,10 @@ class _Worker:
             self.channel.send(packet)
         else:
             socket.send_fds(self.channel, [packet], [fd])
+
+    def note_compiling(self, _module: str, _number: int, _of: int) -> None:
+        """Report that this job takes longer than others of its kind."""
+        self._send(worker_messages.Compiling())
 
     def _reserve(self, job: worker_messages.Job, nbytes: int) -> None:
         """Ask for more memory if the segment needs more than was reserved for it."""
@@ -308,6 +313,8 @@ def work(channel: socket.socket, settings: WorkerSettings) -> int:
 
         served = ServedFrom.from_words(*settings.origin)
         reader = PublishedReader(served, settings.cache_dir, settings.cache_bytes)
+    worker = _Worker(channel, ShmDirectory(settings.shm_dir), cache, reader)
+    watch(worker.note_compiling)
     with contextlib.suppress(BrokenPipeError, ConnectionResetError):
-        _Worker(channel, ShmDirectory(settings.shm_dir), cache, reader).run()
+        worker.run()
     return 0

@@ -19,6 +19,7 @@ __all__ = [
     "Begun",
     "Check",
     "Checked",
+    "Compiling",
     "Decision",
     "Done",
     "Ended",
@@ -94,6 +95,10 @@ class Begun(msgspec.Struct, array_like=True, tag="begun"):
     number: int
 
 
+class Compiling(msgspec.Struct, array_like=True, tag="compiling"):
+    """Report that the worker compiles kernels for its job, once for this version: it takes seconds."""
+
+
 class Need(msgspec.Struct, array_like=True, tag="need"):
     """Report that the segment needs more than was granted; the worker waits for a `Decision`."""
 
@@ -164,7 +169,7 @@ class Ended(msgspec.Struct, array_like=True, tag="ended"):
 
 
 ToWorker: TypeAlias = Job | Check | Root | Decision
-FromWorker: TypeAlias = Ready | Begun | Need | Done | Checked | Failed | Ended
+FromWorker: TypeAlias = Ready | Begun | Compiling | Need | Done | Checked | Failed | Ended
 
 encode: Final = msgspec.msgpack.Encoder().encode
 decode_to_worker: Final = msgspec.msgpack.Decoder[ToWorker](ToWorker).decode

@@ -78,6 +78,8 @@ class Worker:
         When it began its current job; while it only fetches, when its last message arrived.
     opened
         Directory through which it reads files.
+    compiling
+        Whether it compiles kernels for its present job.
     """
 
     channel: socket.socket
@@ -92,6 +94,7 @@ class Worker:
     opened: Opened = NOT_OPENED
     fetches: bool = False
     begun: int = 0
+    compiling: bool = False
 
     @property
     def fd(self) -> int:
@@ -165,6 +168,11 @@ class WorkerPool:
         """Whether a worker could take a job: one that computes a layer, or any other."""
         found = self._least_busy(computed=computed) is not None
         return found or self._may_start or (not computed and self._may_start_one_for_points)
+
+    @property
+    def compiling(self) -> int:
+        """Number of workers that compile kernels now."""
+        return sum(worker.compiling for worker in self._workers.values())
 
     @property
     def free_places(self) -> int:
@@ -336,6 +344,7 @@ class WorkerPool:
             How long the worker worked on the job, seconds.
         """
         began_s, at_work = worker.since_s, worker.at_work == number
+        worker.compiling = False
         job = worker.queue.pop(number, None)
         worker.prefetched.discard(number)
         worker.layers -= job is not None and is_computed(job)

@@ -213,6 +213,7 @@ class Sampler:
         set_value("sessions", len(self.sessions))
         set_value("waiting_requests", len(self.waiting))
         set_value("workers", len(self.scheduler.pool))
+        set_value("loaders_compiling", self.scheduler.pool.compiling)
         set_value("load_queue", len(self.scheduler.loads))
         set_value("events_published", self.event_log.last)
 

@@ -25,7 +25,7 @@ _FORMATS: Final = {4: "%.9g", 8: "%.17g"}  # digits that restore the same bits
 
 def write_pcd(
     target: str | os.PathLike[str] | IO[bytes],
-    columns: Mapping[str, NDArray[Any]],
+    columns: Mapping[str, NDArray[Any]] | NDArray[Any],
     *,
     encoding: str = "binary",
     viewpoint: Sequence[float] = IDENTITY_VIEWPOINT,
@@ -39,8 +39,8 @@ def write_pcd(
         temporary name beside it, is flushed to the disk, and then renamed.
     columns
         Arrays of equal length by name.  ``xyz`` of shape (N, 3) becomes the fields x, y and z; (N, k)
-        becomes one field of COUNT k.  The types are those of PCD: 8 to 64-bit integers, float32 and
-        float64.
+        becomes one field of COUNT k.  An array alone is ``xyz``.  The types are those of PCD: 8 to 64-bit
+        integers, float32 and float64.
     encoding
         ``ascii``, ``binary`` or ``binary_compressed`` (at most 2 GiB of data).  All three keep every bit,
         except the payload of NaNs in ``ascii``.
@@ -56,7 +56,7 @@ def write_pcd(
     """
     if encoding not in ENCODINGS:
         raise BadRequest(f"encoding {encoding!r} is not one of {', '.join(ENCODINGS)}")
-    fields = _fields(columns)
+    fields = _fields(columns if isinstance(columns, Mapping) else {"xyz": columns})
     points = len(fields[0][1]) if fields else 0
     described = [(name, array.dtype, _count(array)) for name, array in fields]
     header = pcd_header(described, points, encoding, viewpoint)

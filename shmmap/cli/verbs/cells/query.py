@@ -8,6 +8,7 @@ import re
 from typing import TYPE_CHECKING
 
 from shmmap.cli.areas import add_area_or_ids, area_from, no_cell_there, print_near_cells
+from shmmap.cli.compiling_lines import saying_what_the_daemon_compiles
 from shmmap.cli.daemon_address import connect
 from shmmap.cli.options import (
     Subparsers,
@@ -110,12 +111,13 @@ def run(args: argparse.Namespace) -> int:
         raise BadRequest("--held needs an area", hint="add --circle, --square or --box")
     layers = layers_from(args)
     with connect(args) as client:
-        if area is None:
-            found = client.selected(args.id, layers, wait=args.wait, strict=None)
-        elif held_given:
-            found = client.differential(area, held, layers, wait=args.wait, strict=None)
-        else:
-            found = client.area(area, layers, wait=args.wait, strict=None)
+        with saying_what_the_daemon_compiles(client):
+            if area is None:
+                found = client.selected(args.id, layers, wait=args.wait, strict=None)
+            elif held_given:
+                found = client.differential(area, held, layers, wait=args.wait, strict=None)
+            else:
+                found = client.area(area, layers, wait=args.wait, strict=None)
         welcome = client.welcome
         if args.json:
             from shmmap.cli.verbs.cells import outputs

@@ -83,6 +83,15 @@ def test_the_bytes_of_a_file() -> None:
     )
 
 
+def test_an_array_alone_is_xyz() -> None:
+    file, same = io.BytesIO(), io.BytesIO()
+    write_pcd(file, XYZ)
+    write_pcd(same, {"xyz": XYZ})
+    assert file.getvalue() == same.getvalue()
+    with pytest.raises(BadRequest, match=r"\(N, 3\) is needed"):
+        write_pcd(io.BytesIO(), XYZ[:, :2])
+
+
 def test_the_bytes_of_a_compressed_body() -> None:
     file = io.BytesIO()
     write_pcd(file, {"xyz": XYZ, "h": np.array([[1, 2], [3, 4]], "i1")}, encoding="binary_compressed")
