@@ -17,6 +17,8 @@ import pytest
 from shmmap.kernel_cache import compiled_mark
 from tests.support.compiled_programs import built_once
 from tests.support.cpp_client import compiled
+from tests.support.kernels_once import watch
+from tests.support.selection import leave_out, pytest_addoption, pytest_ignore_collect  # noqa: F401  hooks
 from tests.support.skips import (  # noqa: F401  hooks
     NEEDS_ROOT,
     programs_or_skip,
@@ -52,6 +54,7 @@ def pytest_configure(config: pytest.Config) -> None:
             mark.touch()  # no daemon of a test compiles kernels unasked
         if cache is None:
             config.add_cleanup(lambda: shutil.rmtree(path, ignore_errors=True))
+    watch(late=True)
 
 
 def pytest_xdist_auto_num_workers() -> int:
@@ -59,8 +62,9 @@ def pytest_xdist_auto_num_workers() -> int:
     return 2 * len(os.sched_getaffinity(0))
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Begin with what takes minutes, lest one worker is left with it at the end; skip what needs root."""
+    leave_out(config, items)
     items.sort(key=lambda item: item.get_closest_marker("minutes") is None)
     if os.geteuid() != 0:
         for item in items:
