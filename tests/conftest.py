@@ -72,10 +72,15 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
                 item.add_marker(pytest.mark.skip(reason=NEEDS_ROOT))
 
 
+def pytest_collection() -> None:
+    """Spare the garbage collector what stays to the end: modules and tests by the thousand."""
+    gc.disable()
+
+
 def pytest_collection_finish() -> None:
-    """Have the garbage collector pass over what stays to the end: modules and tests by the thousand."""
-    gc.collect()
+    """Have it pass over them from now on."""
     gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(autouse=True)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compiled kernels in processes of the tests: none while tests are collected, each compiled by one of them.
 
-Modules of kernels compile as they are imported, and many tests import them at their top.  Here such a module is
-executed when something of it is first used.  A process that lacks a kernel on disk takes its lock, and the others
-wait for the file.
+Modules of kernels compile as they are imported, and many tests import them at their top.  Here such a module
+is executed when something of it is first used.  A process that lacks a kernel on disk takes its lock, and the
+others wait for the file.
 """
 
 from __future__ import annotations
@@ -63,16 +63,16 @@ class _LateModule(types.ModuleType):
 
     def __getattr__(self, name: str) -> Any:
         loader = self.__spec__.loader if self.__spec__ is not None else None
-        if name.startswith("__") or not isinstance(loader, _Late):
-            raise AttributeError(name)
-        loader.execute(self)
-        return getattr(self, name)
+        if not name.startswith("__") and isinstance(loader, _Late):
+            loader.execute(self)
+        return types.ModuleType.__getattribute__(self, name)  # its class is another one now
 
 
 class _Late(Loader):
     def __init__(self, loader: Loader) -> None:
         self._loader = loader
         self._lock = threading.RLock()
+        self._begun = False
 
     def create_module(self, spec: ModuleSpec) -> types.ModuleType:
         return _LateModule(spec.name)
@@ -81,11 +81,12 @@ class _Late(Loader):
         pass
 
     def execute(self, module: types.ModuleType) -> None:
-        """Execute it; other threads wait."""
+        """Execute it, once; other threads wait."""
         with self._lock:
-            if module.__class__ is _LateModule:
-                module.__class__ = types.ModuleType  # what it looks up meanwhile it has, or lacks
+            if not self._begun:
+                self._begun = True
                 self._loader.exec_module(module)
+                module.__class__ = types.ModuleType
 
 
 class _Locked(Loader):

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Hooks that leave out slow tests, unless ``--all``, ``--slow`` or what the command line names asks for them.
 
-Slow is what lies in a folder named ``slow``, ``cpp`` or ``systemd``, at any depth, and is then not even imported;
-and a test, or a parameter, marked ``slow`` among quick ones.  ``-m`` is left to the caller.
+Slow is what lies in a folder named ``slow``, ``cpp`` or ``systemd``, at any depth, and is then not even
+imported; and a test, or a parameter, marked ``slow`` among quick ones.  ``-m`` is left to the caller.
 """
 
 from __future__ import annotations
