@@ -18,7 +18,6 @@ from shmmap.kernel_cache import compiled_mark
 from tests.support.compiled_programs import built_once
 from tests.support.cpp_client import compiled
 from tests.support.kernels_once import watch
-from tests.support.selection import leave_out, pytest_addoption, pytest_ignore_collect  # noqa: F401  hooks
 from tests.support.skips import (  # noqa: F401  hooks
     NEEDS_ROOT,
     programs_or_skip,
@@ -62,9 +61,8 @@ def pytest_xdist_auto_num_workers() -> int:
     return 2 * len(os.sched_getaffinity(0))
 
 
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with what takes minutes, lest one worker is left with it at the end; skip what needs root."""
-    leave_out(config, items)
     items.sort(key=lambda item: item.get_closest_marker("minutes") is None)
     if os.geteuid() != 0:
         for item in items:
