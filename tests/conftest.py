@@ -17,6 +17,7 @@ import pytest
 from shmmap.kernel_cache import compiled_mark
 from tests.support.compiled_programs import built_once
 from tests.support.cpp_client import compiled
+from tests.support.kernels_once import watch
 from tests.support.skips import (  # noqa: F401  hooks
     NEEDS_ROOT,
     programs_or_skip,
@@ -52,6 +53,7 @@ def pytest_configure(config: pytest.Config) -> None:
             mark.touch()  # no daemon of a test compiles kernels unasked
         if cache is None:
             config.add_cleanup(lambda: shutil.rmtree(path, ignore_errors=True))
+    watch(late=True)
 
 
 def pytest_xdist_auto_num_workers() -> int:
@@ -68,10 +70,15 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
                 item.add_marker(pytest.mark.skip(reason=NEEDS_ROOT))
 
 
+def pytest_collection() -> None:
+    """Spare the garbage collector what stays to the end: modules and tests by the thousand."""
+    gc.disable()
+
+
 def pytest_collection_finish() -> None:
-    """Have the garbage collector pass over what stays to the end: modules and tests by the thousand."""
-    gc.collect()
+    """Have it pass over them from now on."""
     gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(autouse=True)

@@ -57,7 +57,15 @@ PACKAGES: Final = (
     "shmmap/origin",
 )
 OWN: Final = "own"
-STAGES: Final = (OWN, "tests/unit", "tests/model", "tests/process", "tests/cpp tests/clients")
+STAGES: Final = (
+    OWN,
+    "tests/unit",
+    "tests/model",
+    "tests/process",
+    "--slow tests/unit tests/model",
+    "--slow tests/process",
+    "--all tests/cpp tests/clients",
+)
 """Tests in the order in which they are tried, the nearest first."""
 LIMIT_S: Final = 2400.0
 """A stage that takes longer has caught its mutant: something waits without end."""

@@ -45,7 +45,7 @@ Factory = Callable[..., DaemonProcess]
 Connect = Callable[..., Any]
 Late = Callable[[str, Callable[[], object], float], AbstractContextManager[Any]]
 
-BOTH = pytest.mark.parametrize("language", ["python", "c++"])
+BOTH = pytest.mark.parametrize("language", ["python", pytest.param("c++", marks=pytest.mark.slow)])
 """For tests that the client in C++ has to pass, too."""
 
 

@@ -33,7 +33,7 @@ Factory = Callable[..., DaemonProcess]
 MakeWindow = Callable[..., Any]
 LONG_S = 60.0
 
-KINDS = ("background", "blocking", "c++")
+KINDS = ("background", "blocking", pytest.param("c++", marks=pytest.mark.slow))
 WITHOUT_A_THREAD = KINDS[1:]
 
 ROUTE = [(-50 + 7.0 * i, 20 * np.sin(i / 3)) for i in range(15)]

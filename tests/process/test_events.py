@@ -27,7 +27,7 @@ Connect = Callable[..., RawClient]
 Listen = Callable[..., Any]
 
 
-@pytest.fixture(params=["python", "c++"])
+@pytest.fixture(params=["python", pytest.param("c++", marks=pytest.mark.slow)])
 def listen(daemon: DaemonFactory, request: pytest.FixtureRequest) -> Iterator[Listen]:
     """Open event streams, in Python and in C++, closed before the daemon is judged."""
     opened: list[Any] = []

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pages are true: their commands and programs run as they stand, one after the other.
 
-The lines that make a virtual environment are run, exactly as they stand, by ``test_first_steps.py`` from a
-clone, and by ``.ci/run``; what GATEWAY.md configures, by ``test_gateway.py``.
+The lines that make a virtual environment are run, exactly as they stand, by ``slow/test_first_steps.py``
+from a clone, and by ``.ci/run``; what GATEWAY.md configures, by ``slow/test_gateway.py``.
 """
 
 from __future__ import annotations
@@ -159,6 +159,7 @@ def test_programs_of_the_readme(newcomer: Terminal) -> None:
     assert int(numbers[2]) > 10_000
 
 
+@pytest.mark.slow
 def test_from_cpp(newcomer: Terminal, tmp_path: Path) -> None:
     """The program counts what the three lines of Python count; what is shown compiles as it stands."""
     if shutil.which("g++") is None:
@@ -231,6 +232,7 @@ def test_a_wall_is_mapped_and_read(tmp_path: Path) -> None:
 # --- PUBLISHING.md ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("layer_kernels")
 def test_a_map_is_published_fetched_and_goes_back(publisher: Terminal, tmp_path: Path) -> None:
     made = make_map(tmp_path / "town", columns=2, rows=2, points=300)
@@ -276,6 +278,7 @@ def test_settings_are_settings(tmp_path: Path) -> None:
     assert config.catalogue_budget_bytes == 256 << 20
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("layer_kernels")
 def test_a_map_is_served_from_a_bucket(buckets: BucketServer, daemon: DaemonFactory, tmp_path: Path) -> None:
     pytest.importorskip("zstandard", reason="zstandard is not installed")
@@ -350,6 +353,7 @@ def test_the_link_is_down(daemon: DaemonFactory, tmp_path: Path) -> None:
             pass
 
 
+@pytest.mark.slow
 def test_a_signed_map_is_served(buckets: BucketServer, daemon: DaemonFactory, tmp_path: Path) -> None:
     pytest.importorskip("tuf", reason="tuf is not installed")
     pytest.importorskip("zstandard", reason="zstandard is not installed")
@@ -396,6 +400,7 @@ def run_in(text: str) -> str:
     return str(found)
 
 
+@pytest.mark.slow
 def test_slices_by_hand(slices: Slices) -> None:
     _, *commands, join = SLICES.commands("by-hand")
     run = run_in("\n".join(map(slices, commands)))
@@ -403,6 +408,7 @@ def test_slices_by_hand(slices: Slices) -> None:
     assert "version  2\nlayers   ndt(leaf=2.0) points\njoined   2 slices\n" in joined
 
 
+@pytest.mark.slow
 def test_slices_by_gnu_parallel(slices: Slices) -> None:
     program = shutil.which("parallel")
     if program is None or "GNU parallel" not in subprocess.check_output([program, "--version"], text=True):
@@ -413,6 +419,7 @@ def test_slices_by_gnu_parallel(slices: Slices) -> None:
     assert "joined   4 slices" in slices(f"shmmap publish s3://maps/town --join {run}")
 
 
+@pytest.mark.slow
 def test_the_script_for_slurm_and_the_manifest_for_kubernetes_make_their_slices(slices: Slices) -> None:
     """Of four shards in 64 slices the second is in the 17th; nothing is in the 18th."""
     script = "\n".join(SLICES.blocks["slurm"])
@@ -431,6 +438,7 @@ def test_the_script_for_slurm_and_the_manifest_for_kubernetes_make_their_slices(
     assert run_in(made) == run_in(again) == run_in(empty)
 
 
+@pytest.mark.slow
 def test_slices_by_dask_on_this_machine(slices: Slices, tmp_path: Path) -> None:
     pytest.importorskip("distributed", reason="dask.distributed is not installed")
     install, example = SLICES.commands("dask")

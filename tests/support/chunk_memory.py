@@ -15,8 +15,8 @@ import time
 
 import numpy as np
 
+from shmmap.chunks import applying_kernels as kernels
 from shmmap.chunks.applying import UNDO_BYTES, ChunkWriter, UndoRecord
-from shmmap.chunks.applying_kernels import begin_writing, end_writing
 from shmmap.chunks.layout import ChunkIdentity, ChunkView, check_consistent, chunk_bytes, new_header
 from shmmap.chunks.marks import Marks
 from shmmap.chunks.occupancy import Occupancy
@@ -95,16 +95,16 @@ def main() -> None:
     view = view_at(map_chunk(fd, path), chunk_bytes(bricks))
     sequence = view.state["sequence"].reshape(1)
     number = 0
-    begin_writing(sequence)
-    end_writing(sequence)
+    kernels.begin_writing(sequence)
+    kernels.end_writing(sequence)
     print("ready", flush=True)
     while True:
         number = number % 1000 + 1
-        begin_writing(sequence)
+        kernels.begin_writing(sequence)
         view.state["version"] += 1
         for brick in view.bricks:
             brick[:] = number
-        end_writing(sequence)
+        kernels.end_writing(sequence)
         end_s = time.perf_counter() + BETWEEN_S
         while time.perf_counter() < end_s:
             pass

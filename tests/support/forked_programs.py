@@ -29,6 +29,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, Final
 
+from tests.support.kernels_once import watch
+
 ROOT: Final = Path(__file__).resolve().parents[2]
 
 _AT_START: Final = ("PYTHON", "LD_", "LC_", "LANG", "NUMBA_")
@@ -307,6 +309,8 @@ def _fork_for_adoption(request: dict[str, Any], fds: list[int], requests: socket
 def main() -> None:
     """Fork for each request; a fork ends as its program does."""
     requests = socket.socket(fileno=int(sys.argv[1]))
+    if "NUMBA_CACHE_DIR" in os.environ:
+        watch(late=False)
     _import_all()
     gc.freeze()
     while True:

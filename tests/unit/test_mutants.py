@@ -77,6 +77,7 @@ def test_the_same_seed_draws_the_same_ones_spread_over_packages() -> None:
     }
 
 
+@pytest.mark.slow
 def test_mutants_broken_together_are_caught_one_by_one(tmp_path: Path) -> None:
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     for tree in (whole, broken):

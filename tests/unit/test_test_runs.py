@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import signal
 import subprocess
@@ -72,6 +73,64 @@ def test_the_list_names_reasons() -> None:
     entries = [line for line in text.splitlines() if line and not line.startswith("#")]
     assert len(allowed_patterns(text)) == len(entries)
     assert all(len(entry.split(maxsplit=1)) == 2 for entry in entries)
+
+
+# --- which tests a run has --------------------------------------------------------------------------------
+
+MARKED = """
+import pytest
+def test_quick(): pass
+@pytest.mark.slow
+def test_slow(): pass
+@pytest.mark.parametrize("one", ["quick", pytest.param("slow", marks=pytest.mark.slow)])
+def test_each(one): pass
+"""
+QUICK = {"marked::test_quick", "marked::test_each[quick]", "slowly::test_it"}
+REST = {"marked::test_slow", "marked::test_each[slow]", "slow::test_it", "systemd::test_it"}
+SELECTIONS = {
+    "": QUICK,
+    "unit": QUICK,
+    "--slow": REST,
+    "--all": QUICK | REST,
+    "unit/slow": {"slow::test_it"},
+    "unit/slow/test_slow.py": {"slow::test_it"},
+    "unit/test_marked.py": {"marked::test_quick", "marked::test_each[quick]"},
+    "unit/test_marked.py::test_slow": {"marked::test_slow"},
+    "unit --slow": REST - {"systemd::test_it"},
+}
+ASKING = """
+import contextlib, io, json, sys
+import pytest
+found = []
+for words in json.load(sys.stdin):
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        pytest.main(["-q", "--collect-only", "-p", "no:dash", "-p", "no:xdist", "--rootdir=.", *words])
+    found.append([line for line in printed.getvalue().splitlines() if "::" in line])
+json.dump(found, sys.stdout)
+"""
+
+
+def test_slow_tests_are_left_out_unless_asked_for(tmp_path: Path) -> None:
+    for name, text in {
+        "unit/test_marked.py": MARKED,
+        "unit/test_slowly.py": "def test_it(): pass\n",
+        "unit/slow/test_slow.py": "def test_it(): pass\n",
+        "systemd/test_systemd.py": "def test_it(): pass\n",
+        "pytest.ini": "[pytest]\naddopts = -p tests.support.selection --import-mode=importlib\n",
+    }.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    done = subprocess.run(
+        [sys.executable, "-c", ASKING],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "PYTEST_ADDOPTS": ""},
+        input=json.dumps([words.split() for words in SELECTIONS]),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    for words, found in zip(SELECTIONS, json.loads(done.stdout), strict=True):
+        assert {one.rsplit("/", 1)[1][5:].replace(".py", "") for one in found} == SELECTIONS[words], words
 
 
 # --- what a run started does not outlive it ---------------------------------------------------------------

@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from shmmap import BadRequest, Cell, CellError, CellInfo, Client, LoadTimeout, MapListing, ShmmapError
 from shmmap.errors import InstanceBusy, MapMissing
 from shmmap.formats.npz_writer import write_npz
+from shmmap_clients.elevation_map import surface
 from shmmap_clients.elevation_map.grid import ElevationGrid
 from shmmap_clients.elevation_map.heights import ElevationRule
 from shmmap_clients.elevation_map.seams import ColumnBox, Columns, Seams, column_boxes
-from shmmap_clients.elevation_map.surface import surface_heights
 
 __all__ = [
     "BuildProgress",
@@ -131,7 +131,7 @@ def _heights_of(
     width = int(rows.i.max()) - low_i + 1
     key = (rows.j - low_j) * width + (rows.i - low_i)
     if rule.name == "surface":
-        columns, heights = surface_heights(rows.values, key, rule)
+        columns, heights = surface.surface_heights(rows.values, key, rule)
     else:
         columns, member = np.unique(key, return_inverse=True)
         member = member.reshape(-1)

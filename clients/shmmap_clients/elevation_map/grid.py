@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap import BadRequest
-from shmmap_clients.elevation_map.holes import fill_holes, fill_reach
+from shmmap_clients.elevation_map import holes
 
 __all__ = ["FILLED", "MEASURED", "NOTHING", "ElevationGrid"]
 
@@ -173,13 +173,13 @@ class ElevationGrid:
         self, begin: int, end: int, fill_radius: float, margin: int, left: int, right: int
     ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
         radius = round(fill_radius / self.resolution, 6)  # so that 0.6 / 0.2 is exactly three columns
-        reach = fill_reach(radius)
+        reach = holes.fill_reach(radius)
         around = self.rows(begin - margin - reach, end + margin + reach, left - reach, right + reach)
         inner = (slice(reach, around.shape[0] - reach), slice(reach, around.shape[1] - reach))
         heights = around[inner]
         kind = np.where(np.isnan(heights), NOTHING, MEASURED).astype(np.uint8)
         if reach:
-            heights = fill_holes(around, radius)[inner]
+            heights = holes.fill_holes(around, radius)[inner]
             # nothing is filled beyond the grid
             row, column = np.arange(begin - margin, end + margin), np.arange(left, right)
             heights[(row < 0) | (row >= self.shape[0])] = np.nan

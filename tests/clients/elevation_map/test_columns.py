@@ -9,11 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from shmmap_clients.elevation_map import holes, surface
 from shmmap_clients.elevation_map.grid import FILLED, MEASURED, NOTHING, ElevationGrid
 from shmmap_clients.elevation_map.heights import ElevationRule
-from shmmap_clients.elevation_map.holes import fill_holes
 from shmmap_clients.elevation_map.seams import Columns, Seams, column_boxes
-from shmmap_clients.elevation_map.surface import surface_heights
 
 from shmmap import BadRequest
 
@@ -54,7 +53,7 @@ def test_the_surface_is_the_chosen_clusters_mean(
         column += [n * 3 + 7] * size
     every = np.concatenate(xyz)
     mixed = rng.permutation(len(every))
-    columns, heights = surface_heights(every[mixed], np.array(column)[mixed], rule)
+    columns, heights = surface.surface_heights(every[mixed], np.array(column)[mixed], rule)
     assert columns.tolist() == [n * 3 + 7 for n in range(150)]
     expected = np.array([slow_surface(part, rule) for part in xyz])
     assert np.array_equal(np.isnan(heights), np.isnan(expected))
@@ -149,7 +148,7 @@ def test_a_plane_goes_on_through_holes(radius: float) -> None:
     heights[10:25, 20:40] = np.nan
     heights[:, 45:] = np.nan
     heights[20, 52] = plane[20, 52]  # a lonely one
-    filled = fill_holes(heights, radius)
+    filled = holes.fill_holes(heights, radius)
     known = ~np.isnan(heights)
     assert np.array_equal(filled[known], heights[known])
     new = np.isnan(heights) & ~np.isnan(filled)
@@ -195,7 +194,7 @@ def test_blocks_fill_as_the_whole_does(tmp_path: Path) -> None:
     outside = grid.rows(-3, 52)
     assert np.isnan(outside[:3]).all()
     assert np.isnan(outside[-2:]).all()
-    whole = fill_holes(heights, 2.0)
+    whole = holes.fill_holes(heights, 2.0)
     for begin, end in ((0, 50), (0, 7), (7, 31), (49, 50)):
         values, kind = grid.filled(begin, end, 1.0)
         assert np.array_equal(values, whole[begin:end], equal_nan=True)

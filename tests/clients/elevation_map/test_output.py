@@ -12,8 +12,8 @@ import pytest
 import tifffile
 from numpy.typing import NDArray
 from PIL import Image
+from shmmap_clients.elevation_map import holes
 from shmmap_clients.elevation_map.grid import ElevationGrid
-from shmmap_clients.elevation_map.holes import fill_holes
 from shmmap_clients.elevation_map.output import hillshade, write_elevation, write_hillshade
 
 from shmmap import BadRequest
@@ -33,7 +33,7 @@ def made(tmp_path: Path) -> Made:
     grid = ElevationGrid.create(tmp_path / "grid", 0.3, (-100, 40), heights.shape)
     j, i = np.nonzero(~np.isnan(heights))
     grid.put(i - 100, j + 40, heights[j, i].astype(np.float64))
-    return grid, fill_holes(heights, 2.0)
+    return grid, holes.fill_holes(heights, 2.0)
 
 
 def test_npz(made: Made, tmp_path: Path) -> None:

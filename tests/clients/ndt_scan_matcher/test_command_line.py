@@ -168,6 +168,7 @@ def test_wrong_words_are_usage_errors(files: dict[str, Path]) -> None:
         assert exit_.value.code == 2
 
 
+@pytest.mark.slow
 def test_warmup_compiles_once(tmp_path: Path) -> None:
     program = [sys.executable, "-m", "shmmap_clients.ndt_scan_matcher", "warmup"]
     environment = {"PATH": "/usr/bin", "NUMBA_CACHE_DIR": str(tmp_path), "HOME": str(tmp_path)}

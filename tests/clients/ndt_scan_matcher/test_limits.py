@@ -24,7 +24,7 @@ from shmmap_clients.ndt_scan_matcher import (
     VoxelMap,
     matrix_from_pose,
 )
-from shmmap_clients.ndt_scan_matcher.backends.kernels import derive
+from shmmap_clients.ndt_scan_matcher.backends import kernels
 from shmmap_clients.ndt_scan_matcher.backends.registry import backend_named
 from shmmap_clients.ndt_scan_matcher.cli import main
 from shmmap_clients.ndt_scan_matcher.drive.drive_summary import DriveStatistics
@@ -219,6 +219,6 @@ def test_many_poses_have_the_same_matrices_and_derivatives_as_one_and_as_the_com
         for pose, T, M in zip(poses, matrices, derivatives, strict=True):
             np.testing.assert_array_equal(T, matrix_from_pose(pose))
             np.testing.assert_array_equal(M, derivatives_of_poses(pose[None], sign)[0])
-        derive(poses, sign, compiled_T, compiled_M)
+        kernels.derive(poses, sign, compiled_T, compiled_M)
         np.testing.assert_allclose(compiled_T, matrices, rtol=0, atol=1e-15)
         np.testing.assert_allclose(compiled_M, derivatives, rtol=0, atol=1e-15)

@@ -656,6 +656,7 @@ def test_the_client_library_says_so(paged: Paged) -> None:
         assert len(client.metadata()) == 16
 
 
+@pytest.mark.slow
 def test_so_does_the_one_in_cpp(paged: Paged, cpp_program: Path) -> None:
     with paged.daemon.turning(), CppClient(cpp_program, paged.daemon.endpoint) as client:
         everywhere = Box(-35.0, -35.0, 35.0, 35.0)

@@ -20,7 +20,7 @@ from tests.support.divided_map import DividedMap
 from tests.unit.daemon.whole_daemon import WholeDaemon
 
 MakeWindow = Callable[..., Any]
-KINDS = ("background", "blocking", "c++")
+KINDS = ("background", "blocking", pytest.param("c++", marks=pytest.mark.slow))
 NEVER = 1e9
 SOON_S = 0.02
 TIMEOUT_S = 60.0

@@ -82,6 +82,7 @@ def test_an_impossible_ratio_is_refused_without_trying() -> None:
     assert not lzf.decompress(np.zeros(1000, np.uint8), output)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bad_at", ["start", "end"])
 def test_a_large_bad_stream_is_refused_before_its_output_exists(tmp_path: Path, bad_at: str) -> None:
     """A megabyte that claims 79 MB of zeros, with a reference before the start."""

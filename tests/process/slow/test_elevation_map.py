@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from shmmap_clients.elevation_map import ElevationRule, WindowHeights, build_elevation_map
+from shmmap_clients.elevation_map import ElevationRule, WindowHeights, build_elevation_map, surface
 from shmmap_clients.elevation_map.build import BuildProgress, MapChanged
-from shmmap_clients.elevation_map.surface import surface_heights
 
 import shmmap
 from shmmap.dividing.map_writer import MapWriter
@@ -41,7 +40,7 @@ def in_one_go(xyz: NDArray[Any], rule: ElevationRule) -> dict[tuple[int, int], f
     low = index.min(axis=0)
     key = (index[:, 1] - low[1]) * 100_000 + index[:, 0] - low[0]
     if rule.name == "surface":
-        columns, heights = surface_heights(xyz, key, rule)
+        columns, heights = surface.surface_heights(xyz, key, rule)
     else:
         columns, member = np.unique(key, return_inverse=True)
         groups = [xyz[member.reshape(-1) == n, 2].astype(np.float64) for n in range(len(columns))]

@@ -42,7 +42,7 @@ from tests.support.process_costs import anonymous_bytes, descriptors
 
 HOW = Scoring("radius", "autoware")
 COPY = DeviceOptions(memory="copy")
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[4]
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -25,7 +25,7 @@ COUNT, LARGEST, LIMIT = 80, 5000, 60_000
 
 USER = """
 import random, sys
-from tests.process.test_object_tier import LIMIT, objects
+from tests.process.slow.test_object_tier import LIMIT, objects
 from shmmap.origin.remote.object_tier import ObjectTier
 from tests.support.map_stores import wait_for_trimming
 cache, seed, rounds = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
@@ -156,7 +156,7 @@ def test_two_accounts_do_not_share(tmp_path: Path) -> None:
     program = (
         "import os, sys\n"
         "from shmmap.origin.remote.object_tier import ObjectTier\n"
-        "from tests.process.test_object_tier import objects\n"
+        "from tests.process.slow.test_object_tier import objects\n"
         "os.setgid(int(sys.argv[2])); os.setuid(int(sys.argv[2]))\n"
         "tier, (name, data) = ObjectTier(sys.argv[1], limit_bytes=1 << 20), next(iter(objects().items()))\n"
         "print(tier.get(name, len(data)) == data, tier.put(name, data), tier.get(name, len(data)) == data)\n"
