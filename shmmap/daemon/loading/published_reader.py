@@ -131,7 +131,7 @@ class ObjectFetcher:
             frame = _get(self._objects, fetch.name)
         except ShmmapError as error:
             frame = error
-        except Exception as error:  # noqa: BLE001  else the job would wait without bound
+        except BaseException as error:  # noqa: BLE001  also panics: else the job would wait without bound
             frame = LoadFailed(f"{fetch.name.path}: {type(error).__name__}: {error}")
         with self._lock:
             self._under_way -= 1

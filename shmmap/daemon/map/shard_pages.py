@@ -168,7 +168,7 @@ class ShardFetcher:
             pass  # `OriginLink` reports it, once
         except ShmmapError as error:
             log.error("part of the list of cells cannot be used", part=name, reason=error)
-        except Exception:  # noqa: BLE001  else the shard would never be fetched again
+        except BaseException:  # noqa: BLE001  also panics: else the shard would never be fetched again
             log.exception("part of the list of cells cannot be used", part=name, cause="a defect in shmmap")
         return None
 

@@ -15,7 +15,7 @@ from typing import Any, Final, TypeVar
 
 from shmmap.errors import ConfigError, MapDataError, MapMissing, Offline
 from shmmap.lazy_imports import FOR_REMOTE, needed_packages
-from shmmap.origin.remote.credentials import find_credentials
+from shmmap.origin.remote.credentials import clean_variables, find_credentials
 from shmmap.origin.remote.store import (
     WEB_SCHEMES,
     Listed,
@@ -130,6 +130,7 @@ class BucketStore:
     ) -> None:
         self.url = where.text
         self._scheme = where.scheme
+        self._instance = instance_credentials
         self._timeouts = timeouts
         self._limit_s = timeouts.retry_s + answer_limit_s(timeouts.read_s, 0)
         self._store = _opened(where, timeouts, insecure=insecure_http, instance=instance_credentials)
@@ -291,15 +292,30 @@ class BucketStore:
             if conditional:
                 raise
             raise StoreRefused(f"{name}: refused, a condition failed that was not set (304 or 412)") from None
-        except (exceptions.PermissionDeniedError, exceptions.UnauthenticatedError) as error:
-            why = _reason(str(error)) or "no permission"
-            raise StoreRefused(f"{name}: refused, {why}", hint=_CLOCK, of_credentials=True) from None
-        except (exceptions.BaseError, OSError) as error:
-            raise _out_of_reach(name, str(error)) from None
         except BaseException as error:
-            if is_panic(error):
-                raise Offline(f"{name}: the request has made the package obstore fail", hint=_PANIC) from None
-            raise
+            if not (is_panic(error) or isinstance(error, exceptions.BaseError | OSError)):
+                raise
+            self._refuse_bad_credentials(name)
+            raise _failure(name, error) from None
+
+    def _refuse_bad_credentials(self, name: str) -> None:
+        """Raise why credentials that are read again and again cannot be used any more, if so."""
+        try:
+            find_credentials(self._scheme, os.environ, instance=self._instance)
+        except ConfigError as error:
+            raise StoreRefused(f"{name}: {error.message}", hint=error.hint, of_credentials=True) from None
+
+
+def _failure(name: str, error: BaseException) -> Offline:
+    """Return our error for one of obstore; only parts of its text without secrets are repeated."""
+    text = str(error)
+    if is_panic(error):
+        return Offline(f"{name}: the request has made the package obstore fail", hint=_PANIC)
+    if isinstance(error, exceptions.PermissionDeniedError | exceptions.UnauthenticatedError):
+        return StoreRefused(
+            f"{name}: refused, {_reason(text) or 'no permission'}", hint=_CLOCK, of_credentials=True
+        )
+    return _out_of_reach(name, text)
 
 
 async def _fill(body: Body, result: obstore.GetResult) -> None:
@@ -374,6 +390,7 @@ def _opened(where: StoreUrl, timeouts: Timeouts, *, insecure: bool, instance: bo
     }
     given: dict[str, Any] = {"client_options": client, "retry_config": retry}
     try:
+        os.environ.update(clean_variables(os.environ))  # obstore reads them by itself
         found = find_credentials(where.scheme, os.environ, instance=instance)
         if found.provider is not None:
             given["credential_provider"] = found.provider

@@ -24,7 +24,7 @@ __all__ = [
     "BYTES_PER_S",
     "Body",
     "answer_limit_s",
-    "call_heard",
+    "call_apart",
     "host_of",
     "is_panic",
     "page",
@@ -211,7 +211,7 @@ def _running_loop() -> asyncio.AbstractEventLoop:
         return _loop[1]
 
 
-def call_heard(call: Callable[[], _Answer]) -> _Answer:
+def call_apart(call: Callable[[], _Answer]) -> _Answer:
     """Call a function that may block; in the main thread such that signals are handled meanwhile.
 
     After an exception of a signal handler, the call goes on in its thread until it ends.

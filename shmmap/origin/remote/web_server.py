@@ -27,7 +27,7 @@ from shmmap.origin.remote.store import Listed, StoreRefused, StoreUrl, Tag, Time
 from shmmap.origin.remote.transport import (
     Body,
     answer_limit_s,
-    call_heard,
+    call_apart,
     refuse_plain_http,
     too_slow,
 )
@@ -283,7 +283,7 @@ class WebServer:
 
     def _ask(self, method: str, path: str, take: _Take[_Answer], *, unless: str | None = None) -> _Answer:
         """Make a request, again if it fails, and return what ``take`` makes of the answer."""
-        return call_heard(partial(self._repeat, method, path, take, unless))
+        return call_apart(partial(self._repeat, method, path, take, unless))
 
     def _repeat(self, method: str, path: str, take: _Take[_Answer], unless: str | None) -> _Answer:
         name, target = f"{self.url}/{path}", f"{self._base}/{urllib.parse.quote(path)}"
