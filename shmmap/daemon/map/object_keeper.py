@@ -23,7 +23,7 @@ from shmmap.origin.remote.published_object import ObjectName
 __all__ = ["Kept", "KeptCell", "ObjectKeeper"]
 
 THREADS: Final = 8
-END_S: Final = 0.5
+END_S: Final = 0.2
 """How long a daemon that stops waits for a thread that waits for the store, seconds."""
 
 

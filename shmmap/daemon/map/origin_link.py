@@ -23,7 +23,7 @@ JITTER: Final = 0.2
 """Random part of the polling interval: the vehicles of a fleet must not poll simultaneously."""
 LONG_TRUST_S: Final = 32.0
 """Longest delay of a poll after a failed fetch, for an origin that keeps answering."""
-END_S: Final = 0.5
+END_S: Final = 0.2
 
 
 class LinkNews(NamedTuple):

@@ -16,6 +16,7 @@ from typing import Any, Final, TypeVar
 from shmmap.errors import ConfigError, MapDataError, MapMissing, Offline
 from shmmap.lazy_imports import FOR_REMOTE, needed_packages
 from shmmap.origin.remote.credentials import clean_variables, find_credentials
+from shmmap.origin.remote.event_loop import run_coroutine, within
 from shmmap.origin.remote.store import (
     WEB_SCHEMES,
     Listed,
@@ -25,14 +26,15 @@ from shmmap.origin.remote.store import (
     Timeouts,
 )
 from shmmap.origin.remote.transport import (
+    BETWEEN,
     BYTES_PER_S,
     Body,
     answer_limit_s,
     host_of,
     is_panic,
+    refuse_page,
     refuse_plain_http,
-    run_coroutine,
-    within,
+    unasked_304,
 )
 
 with needed_packages("a map in a bucket", together=FOR_REMOTE):
@@ -51,32 +53,31 @@ _IMMUTABLE: Final = {
 _CHANGES: Final = {"Cache-Control": "no-cache", "Content-Type": "application/json"}
 _STATUS: Final = re.compile(r"\b([45]\d\d)\b (?:[A-Z][A-Za-z ]+)|status(?: code)?:? ([45]\d\d)")
 _MOVED: Final = re.compile(r"status code: 30[12378]\b")
+_UNASKED: Final = re.compile(r"status code: 304\b")
 _AGAIN: Final = "try again later"
 _SILENT: Final = "is the network up, and the address right? (s3:// has it of AWS_ENDPOINT_URL and AWS_REGION)"
 _REGION: Final = "is AWS_REGION that of the bucket?"
 _CERTIFICATE: Final = "SSL_CERT_FILE names further authorities; is the clock right?"
 _CLOCK: Final = "are the credentials valid, and is the clock right?"
 _PANIC: Final = "this is a defect: please report it, with what the log says before"
-_BETWEEN: Final = "does a proxy between here and the store change its answers?"
 _TRUE_NAMES: Final = (
     (
         "Content-Length Header missing",
         "its answer has no length",
-        f"is it sent in chunks? {_BETWEEN}",
+        f"is it sent in chunks? {BETWEEN}",
     ),
     (
         "ETag Header missing",
         "its answer has no ETag",
-        _BETWEEN,
+        BETWEEN,
     ),
     (
         "invalid list response",
         "its answer is no listing of objects",
         "is it a page, or compressed?",
     ),
-    ("list response body", "its listing ended early", _BETWEEN),
+    ("list response body", "its listing ended early", BETWEEN),
     ("Parse(", "the answer is no HTTP", "is the address right, and its port?"),
-    ("304 Not Modified", "refused (status 304)", _BETWEEN),
 )
 """What is in the text of an obstore error, what it means, and a hint."""
 _NOWHERE: Final = "255.255.255.255:1"
@@ -101,7 +102,7 @@ _ASKED_FOR_CREDENTIALS: Final = (
     "GOOGLE_BASE_URL",
 )
 """Variables with the URL of a server that obstore asks for credentials, or of a store."""
-_BYTES_PER_PAGE: Final = 1 << 20
+_BYTES_PER_PAGE: Final = 1 << 19
 _CODE: Final = re.compile(r"<Code>(\w+)</Code>")
 _REASONS: Final = {
     "ExpiredToken": "the credentials have expired",
@@ -184,11 +185,16 @@ class BucketStore:
 
     def head(self, path: str) -> Listed | None:
         """Return an object's size and time of writing; None if it does not exist."""
+
+        async def head() -> Listed:
+            result = await obstore.get_async(self._store, path, options={"head": True})
+            refuse_page(self._name(path), str(result.attributes.get("Content-Type", "")))
+            return Listed(path, result.meta["size"], result.meta["last_modified"].timestamp())
+
         try:
-            meta = self._ask(path, lambda: obstore.head_async(self._store, path))
+            return self._ask(path, head)
         except MapMissing:
             return None
-        return Listed(path, meta["size"], meta["last_modified"].timestamp())
 
     def list(self, prefix: str) -> Iterator[Listed]:
         """Yield all objects below a prefix."""
@@ -200,9 +206,13 @@ class BucketStore:
             except StopAsyncIteration:
                 return ()
 
+        is_empty = True
         while page := self._ask(prefix, next_page, more_s=_BYTES_PER_PAGE / BYTES_PER_S):
+            is_empty = False
             for meta in page:
                 yield Listed(meta["path"], meta["size"], meta["last_modified"].timestamp())
+        if is_empty:  # obstore takes a page for an empty listing
+            self.head(f"{prefix}none")
 
     # --- writing --------------------------------------------------------------------------------
 
@@ -288,10 +298,14 @@ class BucketStore:
             if "<Code>NoSuchBucket</Code>" in str(error):
                 raise MapMissing(f"{self.url}: there is no such bucket") from None
             raise MapMissing(f"{name} is not there") from None
-        except (exceptions.AlreadyExistsError, exceptions.PreconditionError, exceptions.NotModifiedError):
+        except (exceptions.AlreadyExistsError, exceptions.PreconditionError):
             if conditional:
                 raise
-            raise StoreRefused(f"{name}: refused, a condition failed that was not set (304 or 412)") from None
+            raise StoreRefused(f"{name}: refused (status 412)", hint=BETWEEN) from None
+        except exceptions.NotModifiedError:
+            if conditional:
+                raise
+            raise unasked_304(name) from None
         except BaseException as error:
             if not (is_panic(error) or isinstance(error, exceptions.BaseError | OSError)):
                 raise
@@ -331,6 +345,8 @@ def _out_of_reach(name: str, text: str) -> Offline:
     """Return our error for the text of an obstore error; only parts without secrets are repeated."""
     if _NOWHERE in text or "redirect" in text.lower() or _MOVED.search(text):
         return StoreRefused(f"{name}: refused, it is somewhere else", hint=_REGION)
+    if _UNASKED.search(text):
+        return unasked_304(name)
     for part, says, hint in _TRUE_NAMES:
         if part in text:
             return StoreRefused(f"{name}: {says}", hint=hint)
@@ -343,7 +359,8 @@ def _out_of_reach(name: str, text: str) -> Offline:
         return StoreRefused(f"{name}: refused (status {status})", hint=hint)
     if "certificate" in text.lower():
         return StoreRefused(f"{name}: the server's certificate is not accepted", hint=_CERTIFICATE)
-    return Offline(f"{name}: no answer", hint=_SILENT)
+    in_time = " in time" if "kind: Timeout" in text else ""
+    return Offline(f"{name}: no answer{in_time}", hint=_SILENT)
 
 
 def _reason(text: str) -> str:

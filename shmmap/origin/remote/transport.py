@@ -9,29 +9,27 @@ thread that waits for either still handles signals.
 
 from __future__ import annotations
 
-import asyncio
-import os
 import threading
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Callable
 from concurrent.futures import Future
-from typing import Any, Final, TypeVar
+from typing import Final, NoReturn, TypeVar
 
 from shmmap.errors import BadRequest, MapDataError, Offline
 from shmmap.origin.remote.store import WEB_SCHEMES, StoreRefused, StoreUrl, is_loopback
 from shmmap.origin.remote.zstd_frame import DAMAGED
 
 __all__ = [
+    "BETWEEN",
     "BYTES_PER_S",
     "Body",
     "answer_limit_s",
     "call_apart",
     "host_of",
     "is_panic",
-    "page",
+    "refuse_page",
     "refuse_plain_http",
-    "run_coroutine",
     "too_slow",
-    "within",
+    "unasked_304",
 ]
 
 _Answer = TypeVar("_Answer")
@@ -39,6 +37,8 @@ _Answer = TypeVar("_Answer")
 BYTES_PER_S: Final = 64 << 10
 """Rate below which an answer is given up."""
 _PANICS: Final = ("PanicException", "RustPanic")
+BETWEEN: Final = "does a proxy between here and the store change its answers?"
+_PAGE_BYTES: Final = 64 << 10
 _PORTAL: Final = "is this the login page of a network, or another server than the map's?"
 _CUT: Final = "does the store, or something between here and it, end transfers early?"
 _SLOW: Final = "is the link this slow, or does something between here and the store hold its answers back?"
@@ -47,14 +47,6 @@ _SLOW: Final = "is the link this slow, or does something between here and the st
 def answer_limit_s(read_s: float, nbytes: int) -> float:
     """Return the seconds that an answer of this size may take, once it has begun."""
     return read_s + max(nbytes, BYTES_PER_S) / BYTES_PER_S
-
-
-async def within(name: str, limit_s: float, work: Awaitable[_Answer]) -> _Answer:
-    """Wait for a part of a request, and end it at its limit."""
-    try:
-        return await asyncio.wait_for(work, limit_s)
-    except asyncio.TimeoutError:
-        raise too_slow(name, limit_s) from None
 
 
 def too_slow(name: str, seconds: float) -> Offline:
@@ -88,23 +80,25 @@ class Body:
         self, name: str, size: int | None, max_bytes: int, *, exact: bool, media_type: str, encoding: str
     ) -> None:
         self._name, self._max_bytes, self._exact = name, max_bytes, exact
-        self._media_type = media_type.partition(";")[0].strip().lower()
+        self._most = max(max_bytes, _PAGE_BYTES)  # a page is read, so that it is named
+        self._media_type = media_type
         if encoding and encoding.lower() != "identity":
             raise StoreRefused(
                 f"{name}: its answer is compressed ({encoding[:20]!r}), which was not asked for",
                 hint="objects of a map have to be sent as they are stored",
             )
         self.size = size
-        if size is not None:
-            self._check(size)
+        if size is not None and size > self._most:
+            self._refuse_size(size)
         self._data = bytearray(size or 0)
         self._at = 0
 
     def add(self, piece: bytes | memoryview) -> None:
         """Take the next bytes."""
         end = self._at + len(piece)
+        if end > self._most:
+            self._refuse_size(end, more=" or more")
         if end > len(self._data):
-            self._check(end, is_all=False)
             self._data.extend(bytes(end - len(self._data)))
         self._data[self._at : end] = piece
         self._at = end
@@ -123,31 +117,32 @@ class Body:
         """Return all bytes; raise if some are missing, or if they are a page."""
         if self.lacks:
             raise self.cut()
-        self._check(self._at)
         if bytes(self._data[:64]).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<"):
-            raise self._page()
+            raise _page(self._name, self._media_type)
+        if self._at > self._max_bytes or (self._exact and self._at != self._max_bytes):
+            self._refuse_size(self._at)
         return memoryview(self._data)
 
-    def _check(self, size: int, *, is_all: bool = True) -> None:
-        is_other = self._exact and is_all and size != self._max_bytes
-        if size <= self._max_bytes and not is_other:
-            return
-        if self._media_type == "text/html":
-            raise self._page()
+    def _refuse_size(self, size: int, more: str = "") -> NoReturn:
+        refuse_page(self._name, self._media_type)
         limit = f"not {self._max_bytes:,}" if self._exact else f"at most {self._max_bytes:,} are read"
-        more = "" if is_all else " or more"
         raise MapDataError(f"it has {size:,} bytes{more}, {limit}", path=self._name, cause=DAMAGED)
 
-    def _page(self) -> Offline:
-        return page(self._name, self._media_type)
+
+def refuse_page(name: str, media_type: str) -> None:
+    """Raise if an answer is a page, as captive portals send it in place of every object."""
+    if media_type.lower().startswith("text/html"):
+        raise _page(name, media_type)
 
 
-def page(name: str, media_type: str) -> Offline:
-    """Return the error for a page in place of an object, as captive portals send it."""
-    return StoreRefused(
-        f"{name}: what the store answers is no map: a page ({media_type or 'of no stated type'})",
-        hint=_PORTAL,
-    )
+def _page(name: str, media_type: str) -> Offline:
+    kind = media_type.partition(";")[0].strip().lower() or "of no stated type"
+    return StoreRefused(f"{name}: what the store answers is no map: a page ({kind})", hint=_PORTAL)
+
+
+def unasked_304(name: str) -> Offline:
+    """Return the error for the answer "not modified" to a request that did not ask whether it is."""
+    return StoreRefused(f"{name}: refused (status 304: not modified), which was not asked", hint=BETWEEN)
 
 
 def refuse_plain_http(where: StoreUrl, endpoint: str, *, insecure_http: bool) -> None:
@@ -176,39 +171,6 @@ def is_panic(error: BaseException) -> bool:
 
 
 # --- waiting ------------------------------------------------------------------------------------------
-
-
-_starting: Final = threading.Lock()
-_loop: tuple[int, asyncio.AbstractEventLoop] | None = None  # and the process that it belongs to
-
-
-def run_coroutine(work: Coroutine[Any, Any, _Answer]) -> _Answer:
-    """Run a request in the event loop; an exception in this thread, as Ctrl-C raises, ends the request.
-
-    Raises
-    ------
-    Offline
-        The system allows no more threads.
-    """
-    try:
-        future = asyncio.run_coroutine_threadsafe(work, _running_loop())
-    except RuntimeError:
-        work.close()
-        raise Offline("no request can be made: the system allows no more threads") from None
-    try:
-        return future.result()
-    finally:
-        future.cancel()
-
-
-def _running_loop() -> asyncio.AbstractEventLoop:
-    global _loop
-    with _starting:
-        if _loop is None or _loop[0] != os.getpid():
-            loop = asyncio.new_event_loop()
-            threading.Thread(target=loop.run_forever, name="requests", daemon=True).start()
-            _loop = os.getpid(), loop
-        return _loop[1]
 
 
 def call_apart(call: Callable[[], _Answer]) -> _Answer:

@@ -25,11 +25,14 @@ from typing import Any, Final, NoReturn, TypeAlias, TypeVar
 from shmmap.errors import BadRequest, ConfigError, MapMissing, Offline
 from shmmap.origin.remote.store import Listed, StoreRefused, StoreUrl, Tag, Timeouts
 from shmmap.origin.remote.transport import (
+    BETWEEN,
     Body,
     answer_limit_s,
     call_apart,
+    refuse_page,
     refuse_plain_http,
     too_slow,
+    unasked_304,
 )
 
 __all__ = ["WebServer"]
@@ -97,10 +100,14 @@ class _Clock:
 
     def set_on(self, connected: socket.socket) -> None:
         """Limit the next operation of a socket."""
+        connected.settimeout(min(self.check(), self.read_s))
+
+    def check(self) -> float:
+        """Return the seconds that are left; raise if there are none."""
         left_s = self.until_s - time.monotonic()
         if left_s <= 0:
             raise _Late
-        connected.settimeout(min(left_s, self.read_s))
+        return left_s
 
 
 class _Received(io.RawIOBase):
@@ -115,7 +122,11 @@ class _Received(io.RawIOBase):
 
     def readinto(self, buffer: Any) -> int:
         self._clock.set_on(self._socket)
-        return self._file.readinto(buffer) or 0
+        try:
+            return self._file.readinto(buffer) or 0
+        except TimeoutError:
+            self._clock.check()
+            raise
 
     def close(self) -> None:
         self._file.close()
@@ -353,8 +364,8 @@ class WebServer:
         status, where = response.status, response.getheader("Location", "")
         if status == _OK:
             return
-        if status == _NOT_MODIFIED and "If-None-Match" in headers:
-            raise _NotModified
+        if status == _NOT_MODIFIED:
+            raise _NotModified if "If-None-Match" in headers else unasked_304(name)
         if status in _GONE:
             raise MapMissing(f"{name} is not there")
         if status in _NO_PERMISSION:
@@ -403,7 +414,8 @@ def _described(name: str, response: http.client.HTTPResponse, _clock: _Clock) ->
     """Return an object's size and time of writing, 0 if unknown."""
     length = response.getheader("Content-Length", "")
     if not length.isdecimal():
-        raise StoreRefused(f"{name}: its answer has no length")
+        raise StoreRefused(f"{name}: its answer has no length", hint=BETWEEN)
+    refuse_page(name, response.getheader("Content-Type", ""))
     try:
         return int(length), parsedate_to_datetime(response.getheader("Last-Modified", "")).timestamp()
     except (ValueError, TypeError):
