@@ -22,6 +22,7 @@ __all__ = [
     "BETWEEN",
     "BYTES_PER_S",
     "Body",
+    "Incomplete",
     "answer_limit_s",
     "call_apart",
     "host_of",
@@ -49,9 +50,13 @@ def answer_limit_s(read_s: float, nbytes: int) -> float:
     return read_s + max(nbytes, BYTES_PER_S) / BYTES_PER_S
 
 
+class Incomplete(Offline):
+    """The store answers, but this object has not come whole: others may."""
+
+
 def too_slow(name: str, seconds: float) -> Offline:
     """Return the error for an answer that has taken longer than its limit."""
-    return Offline(f"{name}: the answer was not complete within {seconds:.0f} s", hint=_SLOW)
+    return Incomplete(f"{name}: the answer was not complete within {seconds:.0f} s", hint=_SLOW)
 
 
 class Body:
@@ -91,27 +96,27 @@ class Body:
         if size is not None and size > self._most:
             self._refuse_size(size)
         self._data = bytearray(size or 0)
-        self._at = 0
+        self.at = 0
 
     def add(self, piece: bytes | memoryview) -> None:
         """Take the next bytes."""
-        end = self._at + len(piece)
+        end = self.at + len(piece)
         if end > self._most:
             self._refuse_size(end, more=" or more")
         if end > len(self._data):
             self._data.extend(bytes(end - len(self._data)))
-        self._data[self._at : end] = piece
-        self._at = end
+        self._data[self.at : end] = piece
+        self.at = end
 
     @property
     def lacks(self) -> bool:
         """Whether bytes that the answer announced have not come."""
-        return self.size is not None and self._at < self.size
+        return self.size is not None and self.at < self.size
 
     def cut(self, how: str = "ended") -> Offline:
         """Return the error for an answer that has ended too early."""
         of = f" of {self.size:,}" if self.size is not None else ""
-        return Offline(f"{self._name}: the answer {how} after {self._at:,}{of} bytes", hint=_CUT)
+        return Incomplete(f"{self._name}: the answer {how} after {self.at:,}{of} bytes", hint=_CUT)
 
     def whole(self) -> memoryview:
         """Return all bytes; raise if some are missing, or if they are a page."""
@@ -119,8 +124,8 @@ class Body:
             raise self.cut()
         if bytes(self._data[:64]).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<"):
             raise _page(self._name, self._media_type)
-        if self._at > self._max_bytes or (self._exact and self._at != self._max_bytes):
-            self._refuse_size(self._at)
+        if self.at > self._max_bytes or (self._exact and self.at != self._max_bytes):
+            self._refuse_size(self.at)
         return memoryview(self._data)
 
     def _refuse_size(self, size: int, more: str = "") -> NoReturn:

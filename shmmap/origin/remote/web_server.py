@@ -53,6 +53,7 @@ _LONGEST_PAUSE_S: Final = 5.0
 
 
 _OK: Final = 200
+_PARTIAL: Final = 206
 _NOT_MODIFIED: Final = 304
 _MOVED: Final = (301, 302, 303, 307, 308)
 _NO_PERMISSION: Final = (401, 403)
@@ -257,27 +258,30 @@ class WebServer:
 
     def get(self, path: str, max_bytes: int) -> memoryview:
         """Return a whole object."""
-        return self.get_tagged(path, max_bytes)[0]
+        return self._read(path, _Reading(max_bytes))[0]
 
     def get_exactly(self, path: str, nbytes: int) -> memoryview:
         """Return an object of exactly ``nbytes`` bytes."""
-        return self._ask("GET", path, partial(_read, max_bytes=nbytes, exact=True))[0]
+        return self._read(path, _Reading(nbytes, exact=True))[0]
 
     def get_tagged(self, path: str, max_bytes: int) -> tuple[memoryview, Tag]:
         """Return a whole object, and its ETag."""
-        return self._ask("GET", path, partial(_read, max_bytes=max_bytes))
+        return self._read(path, _Reading(max_bytes))
 
     def get_if_changed(self, path: str, max_bytes: int, tag: Tag) -> tuple[memoryview, Tag] | None:
         """Return a whole object and its ETag; None if the ETag is still that of ``tag``."""
         try:
-            return self._ask("GET", path, partial(_read, max_bytes=max_bytes), unless=tag.get("e_tag"))
+            return self._read(path, _Reading(max_bytes, unless=tag.get("e_tag")))
         except _NotModified:
             return None
+
+    def _read(self, path: str, reading: _Reading) -> tuple[memoryview, Tag]:
+        return self._ask("GET", path, reading.take, reading.headers)
 
     def head(self, path: str) -> Listed | None:
         """Return an object's size and time of writing; None if it does not exist."""
         try:
-            size, modified_s = self._ask("HEAD", path, _described)
+            size, modified_s = self._ask("HEAD", path, _described, dict)
         except MapMissing:
             return None
         return Listed(path, size, modified_s)
@@ -292,17 +296,22 @@ class WebServer:
 
     # --- requests -------------------------------------------------------------------------------
 
-    def _ask(self, method: str, path: str, take: _Take[_Answer], *, unless: str | None = None) -> _Answer:
+    def _ask(
+        self, method: str, path: str, take: _Take[_Answer], headers: Callable[[], dict[str, str]]
+    ) -> _Answer:
         """Make a request, again if it fails, and return what ``take`` makes of the answer."""
-        return call_apart(partial(self._repeat, method, path, take, unless))
+        return call_apart(partial(self._repeat, method, path, take, headers))
 
-    def _repeat(self, method: str, path: str, take: _Take[_Answer], unless: str | None) -> _Answer:
+    def _repeat(
+        self, method: str, path: str, take: _Take[_Answer], headers: Callable[[], dict[str, str]]
+    ) -> _Answer:
         name, target = f"{self.url}/{path}", f"{self._base}/{urllib.parse.quote(path)}"
-        headers = {"User-Agent": "shmmap"} | ({"If-None-Match": unless} if unless else {})
         tries, pause_s, began_s = 0, _FIRST_PAUSE_S, time.monotonic()
         while True:
             try:
-                return self._follow(name, method, target, headers, take, _MAX_REDIRECTS)
+                return self._follow(
+                    name, method, target, {"User-Agent": "shmmap", **headers()}, take, _MAX_REDIRECTS
+                )
             except _Failed as failed:
                 tries += 1
                 if tries > self._timeouts.retries or time.monotonic() - began_s > self._timeouts.retry_s:
@@ -362,7 +371,7 @@ class WebServer:
     ) -> None:
         """Raise what an answer without an object means."""
         status, where = response.status, response.getheader("Location", "")
-        if status == _OK:
+        if status == _OK or (status == _PARTIAL and "Range" in headers):
             return
         if status == _NOT_MODIFIED:
             raise _NotModified if "If-None-Match" in headers else unasked_304(name)
@@ -385,29 +394,49 @@ class WebServer:
         raise refused
 
 
-def _read(
-    name: str, response: http.client.HTTPResponse, clock: _Clock, *, max_bytes: int, exact: bool = False
-) -> tuple[memoryview, Tag]:
-    body = Body(
-        name,
-        response.length,
-        max_bytes,
-        exact=exact,
-        media_type=response.getheader("Content-Type", ""),
-        encoding=response.getheader("Content-Encoding", ""),
-    )
-    clock.allow(max_bytes if body.size is None else body.size)
-    try:
-        while piece := response.read1(_PIECE_BYTES):
-            body.add(piece)
-    except TimeoutError:
-        raise _Failed(body.cut("stopped")) from None
-    except (OSError, http.client.HTTPException):
-        raise _Failed(body.cut()) from None
-    if body.lacks:
-        raise _Failed(body.cut())
-    tag = response.getheader("ETag")
-    return body.whole(), {"e_tag": tag} if tag else {}
+class _Reading:
+    """Reads an object; after a failure in the middle, another request asks for the rest."""
+
+    def __init__(self, max_bytes: int, *, exact: bool = False, unless: str | None = None) -> None:
+        self._max_bytes, self._exact, self._unless = max_bytes, exact, unless
+        self._body: Body | None = None
+        self._tag = ""
+
+    def headers(self) -> dict[str, str]:
+        """Return headers for the next request."""
+        body = self._body
+        if body is not None and body.size is not None and body.at and self._tag.startswith('"'):
+            return {"Range": f"bytes={body.at}-", "If-Range": self._tag}
+        return {"If-None-Match": self._unless} if self._unless else {}
+
+    def take(self, name: str, response: http.client.HTTPResponse, clock: _Clock) -> tuple[memoryview, Tag]:
+        """Read an answer."""
+        body = self._body
+        if response.status == _OK or body is None:
+            self._tag = response.getheader("ETag", "")
+            body = self._body = Body(
+                name,
+                response.length,
+                self._max_bytes,
+                exact=self._exact,
+                media_type=response.getheader("Content-Type", ""),
+                encoding=response.getheader("Content-Encoding", ""),
+            )
+        elif (
+            response.getheader("Content-Range", "").split("/")[0] != f"bytes {body.at}-{(body.size or 0) - 1}"
+        ):
+            raise StoreRefused(f"{name}: its answer is another part than the one asked for", hint=BETWEEN)
+        clock.allow(self._max_bytes if body.size is None else body.size - body.at)
+        try:
+            while piece := response.read1(_PIECE_BYTES):
+                body.add(piece)
+        except TimeoutError:
+            raise _Failed(body.cut("stopped")) from None
+        except (OSError, http.client.HTTPException):
+            raise _Failed(body.cut()) from None
+        if body.lacks:
+            raise _Failed(body.cut())
+        return body.whole(), {"e_tag": self._tag} if self._tag else {}
 
 
 def _described(name: str, response: http.client.HTTPResponse, _clock: _Clock) -> tuple[int, float]:
