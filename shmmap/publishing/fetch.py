@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -28,6 +27,7 @@ from shmmap.origin.remote.published_index import Root
 from shmmap.origin.remote.published_object import POINTS, ObjectName, read_bare_header, rows_of
 from shmmap.origin.remote.store import Store
 from shmmap.origin.remote.zstd_frame import unpack_frame
+from shmmap.processes.request_threads import RequestThreads
 from shmmap.progress import Progress
 
 __all__ = ["FetchedMap", "fetch_map"]
@@ -148,7 +148,7 @@ class _Fetch:
         names: list[str] = []
         progress.stage("fetch", self._root.cells)
         os.makedirs(self._cells_dir, exist_ok=True)
-        with ThreadPoolExecutor(_CONCURRENT_FETCHES, "fetch") as pool:
+        with RequestThreads(_CONCURRENT_FETCHES, "fetch") as pool:
             for shard in read_shards(self._pages, self._root):
                 boxes.append(shard.boxes)
                 names += (here := [name.decode() for name in shard.names])

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Collection, Iterable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import groupby
 from typing import TYPE_CHECKING, Final
@@ -38,6 +37,7 @@ from shmmap.origin.remote.slice_part import (
     with_parts,
 )
 from shmmap.origin.remote.store import Store, refuse_read_only
+from shmmap.processes.request_threads import RequestThreads
 from shmmap.progress import Progress
 from shmmap.publishing.new_version import (
     CONCURRENT_REQUESTS,
@@ -203,7 +203,7 @@ class _Join:
                 raise
 
         try:
-            with ThreadPoolExecutor(_CONCURRENT_READS, "part") as threads:
+            with RequestThreads(_CONCURRENT_READS, "part") as threads:
                 return {part.slice: part for part in threads.map(read, numbers)}
         except MapMissing:
             self._refuse_if_changed()  # another join may have removed the part
@@ -291,7 +291,7 @@ class _Join:
         looked = 0
         self._progress.stage("look for objects", root.cells)
         shards = zip(belongs, read_shards(self._store, base), read_shards(self._store, root), strict=True)
-        with ThreadPoolExecutor(CONCURRENT_REQUESTS, "head") as threads:
+        with RequestThreads(CONCURRENT_REQUESTS, "head") as threads:
             for number, (of_slice, before, after) in enumerate(shards):
                 path = f"{self._store.url}/{self._run.part_path(of_slice)}"
                 changed = changed_layers(before, after, layers, name=path)

@@ -12,7 +12,6 @@ import re
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from hashlib import sha256
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -41,6 +40,7 @@ from shmmap.origin.remote.published_index import (
 from shmmap.origin.remote.store import Store, refuse_read_only
 from shmmap.prepare.run import Failure, task_of
 from shmmap.prepare.task_pool import CellTask
+from shmmap.processes.request_threads import RequestThreads
 from shmmap.progress import Progress
 from shmmap.publishing.messages import CellSent, NotSent, PublishSettings, write_known_objects
 from shmmap.publishing.new_version import (
@@ -311,7 +311,7 @@ class _Run:
         rows: list[_ShardRow] = []
         self._progress.stage("index", len(self._catalogue))
         divided = divide_into_shards(self._catalogue, objects, side)
-        with ThreadPoolExecutor(_SHARDS_PER_BATCH, "shard") as pool:
+        with RequestThreads(_SHARDS_PER_BATCH, "shard") as pool:
             while some := list(itertools.islice(divided, _SHARDS_PER_BATCH)):
                 for row, sent_bytes in pool.map(self._send_shard, some):
                     rows.append(row)

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from shmmap.errors import BadRequest, MapDataError, MapMissing
@@ -21,6 +20,7 @@ from shmmap.origin.remote.map_versions import (
 from shmmap.origin.remote.published_index import Root
 from shmmap.origin.remote.published_object import blob_path
 from shmmap.origin.remote.store import Store
+from shmmap.processes.request_threads import RequestThreads
 from shmmap.progress import Progress
 from shmmap.publishing.new_version import CONCURRENT_REQUESTS, absent_objects, begin_version, switch_version
 
@@ -98,7 +98,7 @@ def _look_for_objects(store: Store, current: Current, progress: Progress) -> int
     missing: list[str] = []
     looked = 0
 
-    with ThreadPoolExecutor(CONCURRENT_REQUESTS, "head") as threads:
+    with RequestThreads(CONCURRENT_REQUESTS, "head") as threads:
         for shard in read_shards(store, root):  # reading shows that the shards exist
             objects = {named for layer in shard.layers.values() for named in layer.objects()}
             missing += map(blob_path, absent_objects(store, sorted(objects), threads))

@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 from collections import OrderedDict
 from collections.abc import Collection, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from hashlib import sha256
 from itertools import pairwise
@@ -55,6 +54,7 @@ from shmmap.origin.remote.store import Store, Tag, put_over, refuse_read_only
 from shmmap.origin.remote.zstd_frame import DAMAGED, unpack_frame
 from shmmap.prepare.run import Failure, task_of
 from shmmap.prepare.task_pool import CellTask
+from shmmap.processes.request_threads import RequestThreads
 from shmmap.progress import Progress
 from shmmap.publishing.messages import CellSent, NotSent, SliceSettings
 from shmmap.publishing.new_version import (
@@ -346,7 +346,7 @@ class _Slice:
         since_s = time() - _THERE_S
         self._progress.stage("look for objects", self._result.cells)
         with (
-            ThreadPoolExecutor(CONCURRENT_REQUESTS, "head") as threads,
+            RequestThreads(CONCURRENT_REQUESTS, "head") as threads,
             contextlib.suppress(MapMissing, MapDataError),
         ):
             root = with_parts(self._root, [part])

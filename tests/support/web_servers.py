@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import gzip
 import hashlib
 import http.server
+import itertools
 import os
 import random
 import re
@@ -14,7 +16,7 @@ import socket
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -25,9 +27,71 @@ from tests.support.daemon_process import Deadline
 Read = Callable[[str], bytes]
 """Returns the content of a path; OSError: there is none."""
 Fault = Callable[[str], str]
-"""What becomes of a request for a path: ``stall`` (no answer), ``stall body`` (but not the rest of one),
-``truncate``, ``corrupt``, a status such as ``503``, or one with Amazon's code such as ``403 ExpiredToken``;
-or nothing."""
+"""What becomes of a request for a path: a status such as ``503``, or one with Amazon's code such as
+``403 ExpiredToken``; one of `WRONG_ANSWERS`; ``stall`` (no answer), ``stall body`` (but not the rest of one),
+``truncate``, ``corrupt``; ``redirect URL``, which is followed by the path; or nothing."""
+
+DRIP_S = 0.05
+PAGE = b"<!DOCTYPE html>\n<html><body>Please log in</body></html>\n"
+
+
+def _head(status: str, *lines: str) -> bytes:
+    return "\r\n".join([f"HTTP/1.1 {status}", *lines, "", ""]).encode()
+
+
+def _length(data: bytes) -> str:
+    return f"Content-Length: {len(data)}"
+
+
+def _drip(data: bytes) -> Iterator[bytes]:
+    """A byte at a time, and so that the end never comes."""
+    for at in itertools.count():
+        yield data[at : at + 1] or b" "
+        time.sleep(DRIP_S)
+
+
+def _chunk(data: bytes) -> bytes:
+    return b"%x\r\n%s\r\n" % (len(data), data)
+
+
+WRONG_ANSWERS: dict[str, Callable[[bytes], Iterable[bytes]]] = {
+    "drip head": lambda _: _drip(_head("200 OK", "X-Long: " + "x" * 10_000)),
+    "drip body": lambda data: itertools.chain([_head("200 OK", _length(data))], _drip(data[:-1])),
+    "drip error": lambda _: itertools.chain([_head("503 Busy", "Content-Length: 9999")], _drip(b"")),
+    "drip chunks": lambda data: itertools.chain(
+        [_head("200 OK", "Transfer-Encoding: chunked")], map(_chunk, _drip(data))
+    ),
+    "continue": lambda _: itertools.chain.from_iterable(
+        (_head("100 Continue"), *_pause()) for _ in itertools.count()
+    ),
+    "endless": lambda _: itertools.chain(
+        [_head("200 OK", "Transfer-Encoding: chunked")], itertools.repeat(_chunk(bytes(1 << 16)))
+    ),
+    "chunked": lambda data: [
+        _head("200 OK", "Transfer-Encoding: chunked"),
+        *(_chunk(data[at : at + 7]) for at in range(0, len(data), 7)), b"0\r\n\r\n",
+    ],
+    "chunked cut": lambda data: [
+        _head("200 OK", "Transfer-Encoding: chunked"), _chunk(data[: len(data) // 2])
+    ],
+    "no length": lambda data: [_head("200 OK", "Connection: close"), data],
+    "cut": lambda data: [_head("200 OK", _length(data)), data[: len(data) // 2]],
+    "gzip": lambda data: [
+        _head("200 OK", "Content-Encoding: gzip", _length(packed := gzip.compress(data))), packed
+    ],
+    "page": lambda _: [_head("200 OK", "Content-Type: text/html; charset=utf-8", _length(PAGE)), PAGE],
+    "page of no type": lambda _: [_head("200 OK", _length(PAGE)), PAGE],
+    "not modified": lambda _: [_head("304 Not Modified")],
+    "partial": lambda data: [_head("206 Partial Content", _length(data[:5])), data[:5]],
+    "no HTTP": lambda _: [b"SSH-2.0-OpenSSH_9.2\r\n"],
+    "closed": lambda _: [],
+}  # fmt: skip
+"""What is sent in place of an answer with this content; then the connection is closed."""
+
+
+def _pause() -> Iterator[bytes]:
+    time.sleep(DRIP_S)
+    yield b""
 
 
 def _no_fault(_path: str) -> str:
@@ -73,6 +137,13 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             web.until_healed()
             self.close_connection = True
             return
+        if fault.startswith("redirect "):
+            web.note(path, 302)
+            self.wfile.write(_head("302 Found", f"Location: {fault.split()[1]}/{path}", "Content-Length: 0"))
+            return
+        if fault in WRONG_ANSWERS:
+            self._answer_wrongly(path, WRONG_ANSWERS[fault])
+            return
         if fault[:3].isdigit():
             status, _, code = fault.partition(" ")
             self._answer(int(status), f"<Error><Code>{code}</Code></Error>".encode() if code else b"")
@@ -96,6 +167,18 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             part = part[:-1] + bytes([part[-1] ^ 1])
         partly = f"bytes {first}-{last}/{len(data)}" if found else ""
         self._answer(206 if found else 200, part, tag, partly=partly, fault=fault)
+
+    do_HEAD = do_PUT = do_POST = do_GET  # noqa: N815  stores ask so, too; only the faults matter then
+
+    def _answer_wrongly(self, path: str, pieces: Callable[[bytes], Iterable[bytes]]) -> None:
+        self.close_connection = True
+        try:
+            data = self.server.web.read(path)
+        except OSError:
+            data = b"x" * 40
+        self.server.web.note(path, 0)
+        for piece in pieces(data):
+            self.wfile.write(piece)
 
     def _answer(self, status: int, data: bytes, tag: str = "", *, partly: str = "", fault: str = "") -> None:
         self.server.web.note(self.path.lstrip("/"), status)

@@ -72,6 +72,7 @@ class LostWorkers:
 
     def end_overdue(self, now_s: float) -> None:
         """Kill workers whose load, or whose start, takes too long."""
+        self.pool.make_places(now_s)
         for worker in self.pool.overdue(now_s):
             if worker.ready:
                 self.statistics.add("loads_timed_out")

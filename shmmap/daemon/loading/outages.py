@@ -28,6 +28,8 @@ __all__ = ["DiskAhead", "OriginWatch"]
 
 LOOK_S: Final = 0.25
 """Interval of checking whether memory has room and whether loads wait, seconds."""
+RESTART_S: Final = 1.0
+"""Interval of starting the thread that polls, if it does not run, seconds."""
 KEPT_S: Final = 60.0
 """How long an object is assumed to stay on the disk, seconds: the disk cache drops unused ones."""
 AGAIN_S: Final = 2.0
@@ -51,17 +53,23 @@ class OriginWatch:
     scheduler: Scheduler
     try_again: Callable[[], None]
     reload: Callable[[], None]
+    _restart_s: float = -math.inf
 
     @property
     def next_s(self) -> float:
-        """At once when a load could not read its source, else never."""
+        """At once when a load could not read its source or nothing polls, else never."""
+        if self.link.is_lost:
+            return self._restart_s
         failed = self.scheduler.prefetcher.health.failed_in_a_row
         return -math.inf if failed and not self.link.is_doubted else math.inf
 
     def run_step(self, now_s: float) -> None:
         """Start a check of whether the origin is reachable."""
-        del now_s
-        self.link.doubt()
+        if self.link.is_lost:
+            self._restart_s = now_s + RESTART_S
+            self.link.restart()
+        else:
+            self.link.doubt()
 
     def collect(self) -> None:
         """Handle the result of the check: once the origin answers again, failed loads are repeated."""

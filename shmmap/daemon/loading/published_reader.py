@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import math
 import os
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -27,6 +29,7 @@ from shmmap.origin.remote.published_object import (
     unpack_source,
     write_segment,
 )
+from shmmap.origin.remote.transport import Incomplete
 from shmmap.origin.remote.zstd_frame import DAMAGED, unpack_frame
 from shmmap.segment.layout import SegmentHeader
 from shmmap.segment.version import Source, Stamp
@@ -37,17 +40,26 @@ CONCURRENT_FETCHES: Final = 32
 """Limit of small objects that a loader fetches concurrently."""
 MAX_BYTES: Final = 8 << 20
 """Limit of bytes of objects that are fetched or held at a time; a single object may be larger."""
+SLOW_S: Final = 0.75
+"""How long an object takes a place from others, seconds."""
+FAILED_LATELY_S: Final = 60.0
+"""How long an object that could not be fetched takes no place from others, seconds."""
 _STACK_BYTES: Final = 512 << 10
 """Stack of a thread; small, because it counts in full towards the loader's memory limit."""
 
 
 @dataclass(eq=False, slots=True)
 class _Fetch:
-    """An object that jobs need; ``frame`` is its data, or why the fetch failed; None until then."""
+    """An object that jobs need; ``frame`` is its data, or why the fetch failed; None until then.
+
+    ``is_slow``: it has taken no place from others since it was found slow.
+    """
 
     name: ObjectName
     jobs: set[int] = field(default_factory=set)
     begun: bool = False
+    begun_s: float = 0.0
+    is_slow: bool = False
     frame: memoryview | ShmmapError | None = None
 
 
@@ -68,8 +80,10 @@ def _get(objects: KeptObjects, name: ObjectName) -> memoryview:
 class ObjectFetcher:
     """Fetches the objects that jobs need, in threads; see `shmmap.layers.sources.Fetcher`.
 
-    An object that two jobs need is fetched once.  As soon as one object is unreachable, all fetches that have
-    not begun fail too: else the jobs would fail one after the other, each after its own timeout.
+    An object that two jobs need is fetched once.  As soon as the store does not answer for one object, all
+    fetches that have not begun fail too: else the jobs would fail one after the other, each after its own
+    timeout.  Objects that have been on their way for long, or have failed lately, take neither places nor
+    bytes from others.
     """
 
     def __init__(self, objects: KeptObjects) -> None:
@@ -77,7 +91,7 @@ class ObjectFetcher:
         self._lock = threading.Lock()
         threading.stack_size(_STACK_BYTES)
         self._threads = ThreadPoolExecutor(
-            CONCURRENT_FETCHES, "fetch"
+            2 * CONCURRENT_FETCHES + 1, "fetch"
         )  # the loader exits without waiting for these threads
         self.fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK | os.EFD_SEMAPHORE)
         self._fetches: dict[bytes, _Fetch] = {}
@@ -85,7 +99,9 @@ class ObjectFetcher:
         self._queue: deque[_Fetch] = deque()
         self._done: deque[int] = deque()
         self._at_work = 0
-        self._under_way = 0
+        self._under_way: set[_Fetch] = set()
+        self._is_watched = False
+        self._failed_s: dict[bytes, float] = {}
         self._held_bytes = 0
 
     def begin(self, number: int, spec: LayerSpec, job: CellJob) -> None:
@@ -131,15 +147,27 @@ class ObjectFetcher:
             frame = _get(self._objects, fetch.name)
         except ShmmapError as error:
             frame = error
-        except Exception as error:  # noqa: BLE001  else the job would wait without bound
+        except BaseException as error:  # noqa: BLE001  also panics: else the job would wait without bound
             frame = LoadFailed(f"{fetch.name.path}: {type(error).__name__}: {error}")
         with self._lock:
-            self._under_way -= 1
-            self._fetch_ended(fetch, frame)
+            self._under_way.discard(fetch)
             if isinstance(frame, Offline):
+                self._failed_s[fetch.name.sha256] = time.monotonic()
+            self._fetch_ended(fetch, frame)
+            if isinstance(frame, Offline) and not isinstance(frame, Incomplete):
                 while self._queue:
                     self._fetch_ended(self._queue.popleft(), frame)
             self._begin_some()
+
+    def _watch(self) -> None:
+        """Look for slow objects until nothing is queued, in a thread."""
+        while True:
+            time.sleep(SLOW_S / 4)
+            with self._lock:
+                self._begin_some()
+                if not self._queue:
+                    self._is_watched = False
+                    return
 
     # --- under the lock ---------------------------------------------------------------------------
 
@@ -150,7 +178,7 @@ class ObjectFetcher:
             fetch.jobs.discard(self._at_work)
             if not fetch.jobs:
                 del self._fetches[digest]
-                self._held_bytes -= fetch.name.size * fetch.begun
+                self._held_bytes -= fetch.name.size * (fetch.begun and not fetch.is_slow)
         self._at_work = 0
         self._begin_some()
 
@@ -160,16 +188,39 @@ class ObjectFetcher:
             os.eventfd_write(self.fd, 1)
 
     def _begin_some(self) -> None:
-        while self._queue and self._under_way < CONCURRENT_FETCHES:
+        now_s = time.monotonic()
+        self._find_slow(now_s)
+        while self._queue:
             fetch = self._queue[0]
-            is_much = self._held_bytes and self._held_bytes + fetch.name.size > MAX_BYTES
-            if is_much and (self._under_way or self._done):
-                break  # held objects are freed when their job is done; without such a job, go on
+            slow = sum(one.is_slow for one in self._under_way)
+            is_slow = now_s < self._failed_s.get(fetch.name.sha256, -math.inf) + FAILED_LATELY_S
+            if is_slow and slow < CONCURRENT_FETCHES:
+                fetch.is_slow = True
+            elif len(self._under_way) - slow >= CONCURRENT_FETCHES:
+                break
+            else:
+                is_much = self._held_bytes and self._held_bytes + fetch.name.size > MAX_BYTES
+                if is_much and (len(self._under_way) > slow or self._done):
+                    break  # held objects are freed when their job is done; without such a job, go on
+                self._held_bytes += fetch.name.size
             self._queue.popleft()
-            fetch.begun = True
-            self._under_way += 1
-            self._held_bytes += fetch.name.size
+            fetch.begun, fetch.begun_s = True, now_s
+            self._under_way.add(fetch)
             self._threads.submit(self._fetch, fetch)
+        if self._queue and not self._is_watched and any(not one.is_slow for one in self._under_way):
+            self._is_watched = True
+            self._threads.submit(self._watch)
+
+    def _find_slow(self, now_s: float) -> None:
+        """Take the places of objects that have been on their way for long, as far as others are queued."""
+        slow = sum(one.is_slow for one in self._under_way)
+        for fetch in self._under_way:
+            if now_s >= fetch.begun_s + SLOW_S and not fetch.is_slow and self._queue:
+                if slow >= CONCURRENT_FETCHES:
+                    return
+                slow += 1
+                fetch.is_slow = True
+                self._held_bytes -= fetch.name.size
 
     def _fetch_ended(self, fetch: _Fetch, frame: memoryview | ShmmapError) -> None:
         fetch.frame = frame

@@ -8,6 +8,7 @@ workers that compute nothing, and while all workers compute, an extra worker is 
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import select
 import signal
@@ -34,6 +35,8 @@ Opened: TypeAlias = tuple[str, int]
 """Directory through which files are read: its path, and its descriptor."""
 NOT_OPENED: Final = ("", -1)
 
+STALLED_S: Final = 0.75
+"""How long no job of a worker that fetches may get its data until the worker gets more places, seconds."""
 JOBS_AHEAD: Final = 4
 """Jobs given to a worker beyond its current one, so that it never waits for the daemon's loop."""
 
@@ -80,6 +83,8 @@ class Worker:
         Directory through which it reads files.
     compiling
         Whether it compiles kernels for its present job.
+    more_places
+        Places beyond the usual ones, while all of those are taken by jobs whose data does not come.
     """
 
     channel: socket.socket
@@ -95,6 +100,7 @@ class Worker:
     fetches: bool = False
     begun: int = 0
     compiling: bool = False
+    more_places: int = 0
 
     @property
     def fd(self) -> int:
@@ -177,7 +183,11 @@ class WorkerPool:
     @property
     def free_places(self) -> int:
         """Number of jobs that could begin at once."""
-        queues = [len(worker.queue) for worker in self._workers.values() if not worker.for_points]
+        queues = [
+            len(worker.queue) - worker.more_places
+            for worker in self._workers.values()
+            if not worker.for_points
+        ]
         free = sum(max(0, self.places - jobs) for jobs in queues)
         return free + self.places * max(0, self.limit - len(queues) - len(self._ending))
 
@@ -186,7 +196,7 @@ class WorkerPool:
         able = [
             worker
             for worker in self._workers.values()
-            if len(worker.queue) < self.places + JOBS_AHEAD
+            if len(worker.queue) < self.places + worker.more_places + JOBS_AHEAD
             and worker.layers <= LAYERS_AHEAD
             and not (worker.for_points if computed else worker.layers)
         ]
@@ -380,6 +390,22 @@ class WorkerPool:
         self._ending.discard(pidfd)
         os.close(pidfd)
 
+    def make_places(self, now_s: float) -> None:
+        """Give as many places again to workers that fetch and whose every place waits for data in vain.
+
+        Otherwise a few objects that come slowly, or never, would hold up all others.
+        """
+        for worker in self._workers.values():
+            if now_s >= self._stalled_s(worker):
+                worker.more_places = self.places
+            elif len(worker.queue) < self.places:
+                worker.more_places = 0
+
+    def _stalled_s(self, worker: Worker) -> float:
+        """Return when a worker gets more places."""
+        may_stall = worker.fetches and worker.ready and not worker.begun and not worker.more_places
+        return worker.since_s + STALLED_S if may_stall and len(worker.queue) >= self.places else math.inf
+
     def overdue(self, now_s: float) -> list[Worker]:
         """Return workers whose load or start has passed its deadline, or that fetch without messages."""
         return [w for w in self._workers.values() if w.queue and now_s >= self._due_s(w)]
@@ -388,8 +414,9 @@ class WorkerPool:
         return worker.since_s + (self.deadline_s if worker.ready else START_DEADLINE_S)
 
     def next_deadline_s(self) -> float:
-        """Return when the next load becomes overdue; infinity when nothing is being loaded."""
-        return min((self._due_s(w) for w in self._workers.values() if w.queue), default=float("inf"))
+        """Return when the next load becomes overdue, or gets more places; infinity when nothing is loaded."""
+        due_s = (min(self._due_s(w), self._stalled_s(w)) for w in self._workers.values() if w.queue)
+        return min(due_s, default=math.inf)
 
     def close(self) -> None:
         """End every worker, and the parent process."""

@@ -23,7 +23,7 @@ from shmmap.origin.remote.published_object import ObjectName
 __all__ = ["Kept", "KeptCell", "ObjectKeeper"]
 
 THREADS: Final = 8
-END_S: Final = 0.5
+END_S: Final = 0.2
 """How long a daemon that stops waits for a thread that waits for the store, seconds."""
 
 
@@ -125,7 +125,7 @@ class ObjectKeeper:
             return Kept(key, False)
         except ShmmapError:  # a loader that needs the object reports the error with the cell's name
             return Kept(key, False)
-        except Exception:  # noqa: BLE001  else the cell would stay under way
+        except BaseException:  # noqa: BLE001  also panics: else the cell would stay under way
             log.exception("an object cannot be kept on disk ahead", cause="a defect in shmmap")
             return Kept(key, False)
         return Kept(key, True)

@@ -23,7 +23,7 @@ JITTER: Final = 0.2
 """Random part of the polling interval: the vehicles of a fleet must not poll simultaneously."""
 LONG_TRUST_S: Final = 32.0
 """Longest delay of a poll after a failed fetch, for an origin that keeps answering."""
-END_S: Final = 0.5
+END_S: Final = 0.2
 
 
 class LinkNews(NamedTuple):
@@ -72,6 +72,20 @@ class OriginLink:
     def is_doubted(self) -> bool:
         """Whether the origin is or may be unreachable, so that it is being polled."""
         return self._is_out or self._is_doubted
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether the thread that polls has ended although it should run, or could not be started."""
+        thread = self._thread
+        return not self._closed and (bool(self._poll_s) if thread is None else not thread.is_alive())
+
+    def restart(self) -> None:
+        """Start the thread again; until it has polled, the origin counts as unreachable."""
+        with self._condition:
+            self._thread = None
+            self._is_out = True
+            os.eventfd_write(self.fd, 1)
+            self._start()
 
     def doubt(self) -> None:
         """Note a failed fetch, and poll whether the origin answers.  May be called in any thread.
@@ -143,7 +157,7 @@ class OriginLink:
         except ShmmapError as error:
             log.error("the map's origin names no usable version", reason=error)
             changed, answers = False, True
-        except Exception:  # noqa: BLE001  else the origin would never be polled again
+        except BaseException:  # noqa: BLE001  also panics of libraries: else the origin would not be polled again
             log.exception("the map's origin cannot be asked", cause="a defect in shmmap")
             changed, answers, reason = False, False, "a defect in shmmap"
         with self._condition:

@@ -7,7 +7,6 @@ import contextlib
 import threading
 import time
 import weakref
-from concurrent.futures import ThreadPoolExecutor
 from hashlib import sha256
 from typing import Final, NamedTuple
 
@@ -44,6 +43,7 @@ from shmmap.origin.remote.published_index import Root, Shard, unpack_root, unpac
 from shmmap.origin.remote.store import PROBE, ObjectReader, Store
 from shmmap.origin.remote.taken_version import TakenVersion, TakenVersionFile, judge_offer
 from shmmap.origin.remote.verify_apart import Verified, VerifySettings, read_trusted_root, verify_apart
+from shmmap.processes.request_threads import RequestThreads
 from shmmap.statistics.counters import REFUSALS
 
 __all__ = ["PublishedOrigin"]
@@ -314,7 +314,7 @@ class PublishedOrigin:
                 return None  # fetched again in the background, which reports the error
 
         lacking = [number for number in range(len(root.keys)) if number not in known]
-        with ThreadPoolExecutor(THREADS, "shards") as pool:
+        with RequestThreads(THREADS, "shards") as pool:
             fetched = zip(lacking, pool.map(fetch, lacking), strict=True)
             known.update((number, shard) for number, shard in fetched if shard is not None)
 

@@ -30,7 +30,7 @@ from shmmap.origin.remote.store import ObjectReader
 __all__ = ["FEW_SHARDS", "THREADS", "Page", "ShardFetcher", "ShardPages"]
 
 THREADS: Final = 8
-END_S: Final = 0.5
+END_S: Final = 0.2
 """How long a daemon that stops waits for a thread that waits for the origin."""
 FEW_SHARDS: Final = 16
 """Up to this number of shards, all are fetched at the start, and kept."""
@@ -168,7 +168,7 @@ class ShardFetcher:
             pass  # `OriginLink` reports it, once
         except ShmmapError as error:
             log.error("part of the list of cells cannot be used", part=name, reason=error)
-        except Exception:  # noqa: BLE001  else the shard would never be fetched again
+        except BaseException:  # noqa: BLE001  also panics: else the shard would never be fetched again
             log.exception("part of the list of cells cannot be used", part=name, cause="a defect in shmmap")
         return None
 

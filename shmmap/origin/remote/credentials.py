@@ -10,6 +10,7 @@ from __future__ import annotations
 import configparser
 import contextlib
 import os
+import re
 from collections.abc import Callable, Mapping
 from datetime import datetime, timedelta, timezone
 from typing import Any, Final, NamedTuple
@@ -17,7 +18,7 @@ from typing import Any, Final, NamedTuple
 from shmmap.errors import ConfigError
 from shmmap.origin.remote.store import BUCKET_SCHEMES
 
-__all__ = ["Credentials", "credentials_source", "find_credentials"]
+__all__ = ["Credentials", "clean_variables", "credentials_source", "find_credentials"]
 
 _DIRECTORY: Final = "CREDENTIALS_DIRECTORY"  # systemd.exec(5), LoadCredential=
 AWS_FILE: Final = "shmmap.aws"
@@ -48,10 +49,22 @@ _GOOGLE: Final = (
     "GOOGLE_SERVICE_ACCOUNT_PATH",
     "SERVICE_ACCOUNT",
 )
+_IN_REQUESTS: Final = re.compile(
+    r"(AWS|AZURE|GOOGLE)_\w*(KEY|SECRET|TOKEN|SAS|REGION|ENDPOINT|ACCOUNT|CLIENT|TENANT|AUTHORITY|BUCKET|ROLE"
+    r"|SSE|ENCRYPTION|URI|URL)\w*"
+)
+"""Variables whose values obstore puts into requests."""
+_MANY_LINES: Final = "GOOGLE_SERVICE_ACCOUNT_KEY"  # a JSON text
+_TOKEN_FILES: Final = (
+    "AWS_WEB_IDENTITY_TOKEN_FILE",
+    "AWS_CONTAINER_AUTHORIZATION_TOKEN_FILE",
+    "AZURE_FEDERATED_TOKEN_FILE",
+)
 _GCLOUD: Final = "~/.config/gcloud/application_default_credentials.json"
 _AGAIN_AFTER: Final = timedelta(minutes=5)
 _TRUE: Final = ("1", "true", "yes", "on")
 
+_NAMES: Final = {"\n": "a line break", "\r": "a line break", "\t": "a tabulator"}
 _UNSIGNED: Final = "nowhere: requests are not signed"
 _INSTANCE: Final = "the cloud's metadata address (instance_credentials)"
 _NO_SIGNATURE: Final = {"skip_signature": True}
@@ -81,10 +94,48 @@ def find_credentials(scheme: str, environment: Mapping[str, str], *, instance: b
     Raises
     ------
     ConfigError
-        A profile's credentials are of an unsupported kind, or incomplete, or a file of them is malformed.
+        A profile's credentials are of an unsupported kind, or incomplete, or a file of them is malformed, or
+        a value contains a character that a request cannot contain.
     """
+    environment = {**environment, **clean_variables(environment)}
+    for name in _TOKEN_FILES:
+        if path := environment.get(name):
+            with contextlib.suppress(OSError, UnicodeDecodeError), open(path, encoding="utf-8") as file:
+                _clean(file.read(), origin=path)
     find = {"s3": _s3_credentials, "gs": _google_credentials, "az": _azure_credentials}[scheme]
     return find(environment, instance)
+
+
+def clean_variables(environment: Mapping[str, str]) -> dict[str, str]:
+    """Return the variables for requests that have white space around their values, without it.
+
+    Raises
+    ------
+    ConfigError
+        A value contains a character that a request cannot contain, such as a line break in its middle.
+    """
+    changed = {}
+    for name, value in environment.items():
+        if _IN_REQUESTS.fullmatch(name) and name != _MANY_LINES:
+            clean = _clean(value, key=name, origin="environment")
+            if clean != value:
+                changed[name] = clean
+    return changed
+
+
+def _clean(value: str, *, key: str = "", origin: str) -> str:
+    """Return a value without white space around it; refuse what no header of a request can contain."""
+    clean = value.strip()
+    for at, character in enumerate(clean):
+        if not (character.isascii() and character.isprintable()):
+            raise ConfigError(
+                f"{key or origin} has {_NAMES.get(character, f'the character U+{ord(character):04X}')} after"
+                f" its first {at} characters, which a request cannot contain",
+                key=key,
+                origin=origin,
+                hint="was it copied whole, and nothing else with it?",
+            )
+    return clean
 
 
 def credentials_source(scheme: str, environment: Mapping[str, str], *, instance: bool = False) -> str:
@@ -164,10 +215,11 @@ def _static_keys(environment: Mapping[str, str]) -> tuple[dict[str, Any], str] |
             continue
         key, secret = section.get("aws_access_key_id"), section.get("aws_secret_access_key")
         if key and secret:
+            token = section.get("aws_session_token", "")
             keys = {
-                "access_key_id": key,
-                "secret_access_key": secret,
-                "token": section.get("aws_session_token") or None,
+                "access_key_id": _clean(key, key="aws_access_key_id", origin=path),
+                "secret_access_key": _clean(secret, key="aws_secret_access_key", origin=path),
+                "token": _clean(token, key="aws_session_token", origin=path) or None,
             }
             return keys, f"profile {profile or 'default'!r} of {_named(environment, path)}"
         _refuse_kinds(section, path, profile or "default")
@@ -195,7 +247,8 @@ def _refuse_kinds(section: Mapping[str, str], path: str, profile: str) -> None:
 
 def _region(environment: Mapping[str, str]) -> str:
     section = _section(_config_file(environment), _config_section(environment.get("AWS_PROFILE", "")))
-    return (section or {}).get("region", "")
+    region = (section or {}).get("region", "")
+    return _clean(region, key="region", origin=_config_file(environment))
 
 
 def _config_file(environment: Mapping[str, str]) -> str:
@@ -239,7 +292,9 @@ def _azure_credentials(environment: Mapping[str, str], instance: bool) -> Creden
         setting = "sas_key" if name == "SAS_TOKEN" else name.lower()
         for variable in (f"AZURE_{name}", f"AZURE_STORAGE_{name}"):
             if found.get(variable):
-                settings[setting], variables[setting] = found[variable], variable
+                origin = files[0] if variable in in_file else "environment"
+                settings[setting] = _clean(found[variable], key=variable, origin=origin)
+                variables[setting] = variable
     if secrets := sorted(settings.keys() & _AZURE_SECRETS):
         variable = variables[secrets[0]]
         is_in_file = variable in in_file

@@ -13,7 +13,6 @@ import datetime
 import json
 import re
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from hashlib import sha256
 from typing import Any, Final, NamedTuple, TypeVar
 
@@ -25,6 +24,7 @@ from shmmap.origin.remote.published_index import MAX_ROOT_BYTES, Root, Shard, un
 from shmmap.origin.remote.published_object import blob_path
 from shmmap.origin.remote.store import ObjectReader, Store, Tag, put_over
 from shmmap.origin.remote.zstd_frame import DAMAGED
+from shmmap.processes.request_threads import RequestThreads
 
 __all__ = [
     "CURRENT",
@@ -231,7 +231,7 @@ def read_shards(store: ObjectReader, root: Root) -> Iterator[Shard]:
     def read(number: int) -> Shard:
         return unpack_shard(read_shard_object(store, root, number), root, number)
 
-    with ThreadPoolExecutor(_CONCURRENT_READS, "shard") as pool:
+    with RequestThreads(_CONCURRENT_READS, "shard") as pool:
         for begin in range(0, len(root.keys), _CONCURRENT_READS):  # few decoded shards in memory at a time
             yield from pool.map(read, range(begin, min(begin + _CONCURRENT_READS, len(root.keys))))
 
@@ -265,8 +265,11 @@ def refuse_if_signed(store: Store, what: str) -> None:
     BadRequest
         The map is signed.
     """
-    if store.head(TIMESTAMP) is not None:
-        raise BadRequest(f"the map at {store.url} is signed", hint=what)
+    try:
+        store.get(TIMESTAMP, MAX_METADATA_BYTES)  # whole: a page that answers every request is no signature
+    except MapMissing:
+        return
+    raise BadRequest(f"the map at {store.url} is signed", hint=what)
 
 
 def new_entry_now(current: Current, before: int) -> Entry:

@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 
 from shmmap.errors import MapDataError, MapMissing, Offline
 from shmmap.formats.durable_file import appearing_file, locked_file, writing_errors
-from shmmap.origin.remote.store import LONG_RUN, SERVING, Listed, Store, Tag, Timeouts, read_url
+from shmmap.origin.remote.store import LONG_RUN, SERVING, WEB_SCHEMES, Listed, Store, Tag, Timeouts, read_url
 from shmmap.origin.remote.zstd_frame import DAMAGED
 
 __all__ = [
@@ -51,6 +51,10 @@ def open_store(
     where = read_url(url)
     if where.scheme == "file":
         return DirectoryStore(where.path)
+    if where.scheme in WEB_SCHEMES:
+        from shmmap.origin.remote.web_server import WebServer
+
+        return WebServer(where, timeouts=timeouts, insecure_http=insecure_http)
     from shmmap.origin.remote.bucket_store import BucketStore
 
     return BucketStore(

@@ -159,7 +159,7 @@ SERVING: Final = Timeouts(connect_s=1.0, read_s=2.0, retries=2, retry_s=2.5)
 """For requests that clients wait for; a silent server is asked once more."""
 PROBE: Final = Timeouts(connect_s=1.0, read_s=1.0, retries=0, retry_s=1.0)
 """To find out whether a server is back."""
-LONG_RUN: Final = Timeouts(connect_s=10.0, read_s=30.0, retries=8, retry_s=120.0)
+LONG_RUN: Final = Timeouts(connect_s=10.0, read_s=30.0, retries=8, retry_s=31.0)
 """For long runs."""
 
 

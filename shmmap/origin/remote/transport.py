@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How long an answer of a store may take, how large it may be, and what is said of one that is wrong.
+
+A limit for each read alone would let a server that sends a byte a second hold a request for hours.  So each
+whole answer has one: ``read_s`` and a second for every 64 KiB of it.  Requests to buckets run in an event
+loop in a thread of its own, which can end them; requests to web servers watch the clock at each read.  A main
+thread that waits for either still handles signals.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import Final, NoReturn, TypeVar
+
+from shmmap.errors import BadRequest, MapDataError, Offline
+from shmmap.origin.remote.store import WEB_SCHEMES, StoreRefused, StoreUrl, is_loopback
+from shmmap.origin.remote.zstd_frame import DAMAGED
+
+__all__ = [
+    "BETWEEN",
+    "BYTES_PER_S",
+    "Body",
+    "Incomplete",
+    "answer_limit_s",
+    "call_apart",
+    "host_of",
+    "is_panic",
+    "refuse_page",
+    "refuse_plain_http",
+    "too_slow",
+    "unasked_304",
+]
+
+_Answer = TypeVar("_Answer")
+
+BYTES_PER_S: Final = 64 << 10
+"""Rate below which an answer is given up."""
+_PANICS: Final = ("PanicException", "RustPanic")
+BETWEEN: Final = "does a proxy between here and the store change its answers?"
+_PAGE_BYTES: Final = 64 << 10
+_PORTAL: Final = "is this the login page of a network, or another server than the map's?"
+_CUT: Final = "does the store, or something between here and it, end transfers early?"
+_SLOW: Final = "is the link this slow, or does something between here and the store hold its answers back?"
+
+
+def answer_limit_s(read_s: float, nbytes: int) -> float:
+    """Return the seconds that an answer of this size may take, once it has begun."""
+    return read_s + max(nbytes, BYTES_PER_S) / BYTES_PER_S
+
+
+class Incomplete(Offline):
+    """The store answers, but this object has not come whole: others may."""
+
+
+def too_slow(name: str, seconds: float) -> Offline:
+    """Return the error for an answer that has taken longer than its limit."""
+    return Incomplete(f"{name}: the answer was not complete within {seconds:.0f} s", hint=_SLOW)
+
+
+class Body:
+    """The bytes of one answer, as they come.
+
+    Parameters
+    ----------
+    name
+        The object's URL, for messages.
+    size
+        Bytes that the answer announces; None if it does not.
+    max_bytes, exact
+        The most that is read; with ``exact``, what the object must have.
+    media_type, encoding
+        Headers ``Content-Type`` and ``Content-Encoding`` of the answer.
+
+    Raises
+    ------
+    MapDataError
+        The answer announces another size.
+    Offline
+        It is a page, or compressed.
+    """
+
+    def __init__(
+        self, name: str, size: int | None, max_bytes: int, *, exact: bool, media_type: str, encoding: str
+    ) -> None:
+        self._name, self._max_bytes, self._exact = name, max_bytes, exact
+        self._most = max(max_bytes, _PAGE_BYTES)  # a page is read, so that it is named
+        self._media_type = media_type
+        if encoding and encoding.lower() != "identity":
+            raise StoreRefused(
+                f"{name}: its answer is compressed ({encoding[:20]!r}), which was not asked for",
+                hint="objects of a map have to be sent as they are stored",
+            )
+        self.size = size
+        if size is not None and size > self._most:
+            self._refuse_size(size)
+        self._data = bytearray(size or 0)
+        self.at = 0
+
+    def add(self, piece: bytes | memoryview) -> None:
+        """Take the next bytes."""
+        end = self.at + len(piece)
+        if end > self._most:
+            self._refuse_size(end, more=" or more")
+        if end > len(self._data):
+            self._data.extend(bytes(end - len(self._data)))
+        self._data[self.at : end] = piece
+        self.at = end
+
+    @property
+    def lacks(self) -> bool:
+        """Whether bytes that the answer announced have not come."""
+        return self.size is not None and self.at < self.size
+
+    def cut(self, how: str = "ended") -> Offline:
+        """Return the error for an answer that has ended too early."""
+        of = f" of {self.size:,}" if self.size is not None else ""
+        return Incomplete(f"{self._name}: the answer {how} after {self.at:,}{of} bytes", hint=_CUT)
+
+    def whole(self) -> memoryview:
+        """Return all bytes; raise if some are missing, or if they are a page."""
+        if self.lacks:
+            raise self.cut()
+        if bytes(self._data[:64]).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<"):
+            raise _page(self._name, self._media_type)
+        if self.at > self._max_bytes or (self._exact and self.at != self._max_bytes):
+            self._refuse_size(self.at)
+        return memoryview(self._data)
+
+    def _refuse_size(self, size: int, more: str = "") -> NoReturn:
+        refuse_page(self._name, self._media_type)
+        limit = f"not {self._max_bytes:,}" if self._exact else f"at most {self._max_bytes:,} are read"
+        raise MapDataError(f"it has {size:,} bytes{more}, {limit}", path=self._name, cause=DAMAGED)
+
+
+def refuse_page(name: str, media_type: str) -> None:
+    """Raise if an answer is a page, as captive portals send it in place of every object."""
+    if media_type.lower().startswith("text/html"):
+        raise _page(name, media_type)
+
+
+def _page(name: str, media_type: str) -> Offline:
+    kind = media_type.partition(";")[0].strip().lower() or "of no stated type"
+    return StoreRefused(f"{name}: what the store answers is no map: a page ({kind})", hint=_PORTAL)
+
+
+def unasked_304(name: str) -> Offline:
+    """Return the error for the answer "not modified" to a request that did not ask whether it is."""
+    return StoreRefused(f"{name}: refused (status 304: not modified), which was not asked", hint=BETWEEN)
+
+
+def refuse_plain_http(where: StoreUrl, endpoint: str, *, insecure_http: bool) -> None:
+    """Raise `BadRequest` if requests would go to another machine in plain text and that is not allowed."""
+    if endpoint.lower().startswith("http://") and not insecure_http and not is_loopback(host_of(endpoint)):
+        raise BadRequest(
+            f"{where.text}: plain http:// can be read and changed in transit",
+            hint="use https://, or --insecure-http"
+            + (", or --trust ROOT.json where the map is signed" if where.scheme in WEB_SCHEMES else ""),
+        )
+
+
+def host_of(url: str) -> str:
+    """Return the host name of a URL; empty if it has none."""
+    from urllib.parse import urlsplit
+
+    try:
+        return urlsplit(url).hostname or ""
+    except ValueError:
+        return ""
+
+
+def is_panic(error: BaseException) -> bool:
+    """Whether an error is a panic of a library in Rust; most are no `Exception`."""
+    return any(kind.__name__ in _PANICS for kind in type(error).__mro__)
+
+
+# --- waiting ------------------------------------------------------------------------------------------
+
+
+def call_apart(call: Callable[[], _Answer]) -> _Answer:
+    """Call a function that may block; in the main thread such that signals are handled meanwhile.
+
+    After an exception of a signal handler, the call goes on in its thread until it ends.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return call()
+    future: Future[_Answer] = Future()
+
+    def run() -> None:
+        try:
+            future.set_result(call())
+        except BaseException as error:  # noqa: BLE001  raised in the main thread
+            future.set_exception(error)
+
+    threading.Thread(target=run, name="request", daemon=True).start()
+    return future.result()
