@@ -9,17 +9,29 @@ from __future__ import annotations
 
 import os
 import re
+import threading
 from collections.abc import Callable, Iterator
 from datetime import timedelta
+from hashlib import sha256
 from typing import Any, Final, TypeVar
 from urllib.parse import urlsplit
 
 from shmmap.errors import BadRequest, ConfigError, MapDataError, MapMissing, Offline
 from shmmap.lazy_imports import FOR_REMOTE, needed_packages
+from shmmap.origin.remote.conditions import (
+    ASKED,
+    Seen,
+    ask_conditions,
+    asked_content,
+    refuse_foreign,
+    refuse_unsafe_tag,
+)
 from shmmap.origin.remote.credentials import find_credentials
 from shmmap.origin.remote.store import (
     WEB_SCHEMES,
     Listed,
+    NoBucket,
+    NoTag,
     StoreRefused,
     StoreUrl,
     Tag,
@@ -34,7 +46,7 @@ with needed_packages("a map in a bucket or at a web server", together=FOR_REMOTE
     from obstore import exceptions
     from obstore.store import AzureStore, GCSStore, HTTPStore, S3Store
 
-__all__ = ["BucketStore", "server_url"]
+__all__ = ["BucketStore", "SolePublisherStore", "server_url"]
 
 _Answer = TypeVar("_Answer")
 
@@ -60,7 +72,13 @@ _REASONS: Final = {
     "AccessDenied": "no permission",
 }
 """Meanings of Amazon's error codes, which other stores use, too."""
+_NO_BUCKET: Final = re.compile(
+    r"<Code>(NoSuchBucket|ContainerNotFound)</Code>|The specified (bucket|container) does not exist"
+)
+"""In the answers of Amazon and Google (XML and JSON), and of Azure."""
+_NO_TAG: Final = "ETag Header missing"
 _OBJECTS_PER_PAGE: Final = 1000
+_MAX_LOOK_BYTES: Final = 1 << 16
 
 
 class BucketStore:
@@ -81,6 +99,8 @@ class BucketStore:
             else ""
         )
         self._store = _opened(where, timeouts, insecure=insecure_http, instance=instance_credentials)
+        self._asking = threading.Lock()
+        self._is_asked = False
 
     # --- reading --------------------------------------------------------------------------------
 
@@ -113,8 +133,7 @@ class BucketStore:
             if size > max_bytes or (exact and size != max_bytes):
                 limit = f"not {max_bytes:,}" if exact else f"at most {max_bytes:,} are read"
                 raise MapDataError(f"it has {size:,} bytes, {limit}", path=self._name(path), cause=DAMAGED)
-            named = {key: meta[key] for key in ("e_tag", "version") if meta[key] is not None}
-            return result.bytes(), named
+            return result.bytes(), _named(meta)
 
         data, tag = self._ask(path, read)
         return memoryview(data), tag
@@ -144,24 +163,27 @@ class BucketStore:
         """Write an object that never changes."""
         self._put(path, data, None, _IMMUTABLE)
 
+    def require_conditions(self, tag: Tag | None = None) -> None:
+        """Ask the store once whether it writes on conditions; see `conditions.ask_conditions`."""
+        refuse_read_only(self)
+        with self._asking:
+            if not self._is_asked:
+                ask_conditions(self)
+                self._is_asked = True
+        if tag is not None:
+            refuse_unsafe_tag(self.url, tag)
+
     def put_new(self, path: str, data: bytes) -> bool:
         """Write an object if none exists at this path."""
-        try:
-            self._put(path, data, "create", _CHANGES)
-        except (exceptions.AlreadyExistsError, exceptions.PreconditionError):
-            return self._has(path, data)
-        return True
+        return self.write(path, data, create=True) is not None or self._has(path, data)
 
     def put_if(self, path: str, data: bytes, tag: Tag) -> bool:
         """Replace an object if it is still in the state that ``tag`` names."""
-        wanted = dict(tag)
-        if self._scheme == "s3":
-            wanted["e_tag"] = wanted["e_tag"].strip('"')  # Ceph's gateway needs it bare; Amazon takes both
+        refuse_unsafe_tag(self.url, tag)
         try:
-            self._put(path, data, wanted, _CHANGES)
-        except (exceptions.AlreadyExistsError, exceptions.PreconditionError, MapMissing):
-            return self._has(path, data)
-        return True
+            return self.write(path, data, tag) is not None or self._has(path, data)
+        except MapMissing:
+            return False
 
     def _has(self, path: str, data: bytes) -> bool:
         """Whether an object already has ``data``: the reply to an earlier attempt may have been lost."""
@@ -170,9 +192,33 @@ class BucketStore:
         except (MapMissing, MapDataError):
             return False
 
-    def _put(self, path: str, data: bytes, mode: Any, attributes: dict[str, str]) -> None:
+    def write(
+        self, path: str, data: bytes, only_if: Tag | None = None, *, create: bool = False
+    ) -> Tag | None:
+        """Write an object that changes and return its tag; None if a condition is not met."""
+        mode: Any = "create" if create else None
+        if only_if is not None:
+            mode = dict(only_if)
+            if self._scheme == "s3":
+                mode["e_tag"] = mode["e_tag"].strip('"')  # Ceph's gateway needs it bare; Amazon takes both
+        try:
+            return _named(self._put(path, data, mode, _CHANGES))
+        except (exceptions.AlreadyExistsError, exceptions.PreconditionError):
+            return None
+
+    def look(self, path: str) -> Seen:
+        """Return what the store returns for an object, however large it says that this is."""
+
+        def read() -> Seen:
+            result = obstore.get(self._store, path)
+            data = result.bytes() if result.meta["size"] <= _MAX_LOOK_BYTES else b""
+            return Seen(bytes(data), _named(result.meta), result.attributes.get("Content-Type", ""))
+
+        return self._ask(path, read)
+
+    def _put(self, path: str, data: bytes, mode: Any, attributes: dict[str, str]) -> Any:
         refuse_read_only(self)
-        self._ask(
+        return self._ask(
             path,
             lambda: obstore.put(
                 self._store, path, data, mode=mode, attributes=attributes, use_multipart=False
@@ -201,8 +247,8 @@ class BucketStore:
         try:
             return ask()
         except (exceptions.NotFoundError, FileNotFoundError) as error:
-            if "<Code>NoSuchBucket</Code>" in str(error):
-                raise MapMissing(f"{self.url}: there is no such bucket") from None
+            if _NO_BUCKET.search(str(error)):
+                raise NoBucket(f"{self._name(path)}: there is no such bucket", status=404) from None
             raise MapMissing(f"{self._name(path)} is not there") from None
         except (exceptions.AlreadyExistsError, exceptions.PreconditionError):
             if conditional:
@@ -213,21 +259,77 @@ class BucketStore:
         except (exceptions.PermissionDeniedError, exceptions.UnauthenticatedError) as error:
             why = _reason(str(error)) or "no permission"
             raise StoreRefused(
-                f"{self._name(path)}: refused, {why}", hint=_CLOCK, of_credentials=True
+                f"{self._name(path)}: refused, {why}", hint=_CLOCK, of_credentials=True, status=403
             ) from None
         except (exceptions.BaseError, OSError) as error:
             raise _out_of_reach(self._name(path), str(error)) from None
 
 
+class SolePublisherStore(BucketStore):
+    """A bucket that is written without conditions: what they would compare is read first.
+
+    If another publisher comes between reading and writing, its version is lost.
+    """
+
+    def require_conditions(self, tag: Tag | None = None) -> None:
+        """Write the small object, and compare what the store returns for it."""
+        del tag
+        with self._asking:
+            if not self._is_asked:
+                data = asked_content()
+                self.write(ASKED, data)
+                if refuse_foreign(self).data != data:
+                    raise StoreRefused(
+                        f"{self._name(ASKED)}: the store has accepted it, and returns another one",
+                        hint="does another program publish there at the same time?",
+                    )
+                self._is_asked = True
+
+    def get_tagged(self, path: str, max_bytes: int) -> tuple[memoryview, Tag]:
+        """Return a whole object, and its hash: the store may give no usable ETag."""
+        data, _ = super().get_tagged(path, max_bytes)
+        return data, {"sha256": sha256(data).digest(), "size": len(data)}
+
+    def put_new(self, path: str, data: bytes) -> bool:
+        """Write an object if there is none."""
+        try:
+            return bytes(self.get(path, len(data))) == data
+        except MapDataError:
+            return False
+        except MapMissing:
+            self.write(path, data)
+        return True
+
+    def put_if(self, path: str, data: bytes, tag: Tag) -> bool:
+        """Replace an object if it still has the hash of ``tag``."""
+        try:
+            _, now = self.get_tagged(path, tag["size"])
+        except (MapMissing, MapDataError):
+            return False
+        if now != tag:
+            return False
+        self.write(path, data)
+        return True
+
+
+def _named(result: Any) -> Tag:
+    """Return the tag from obstore's description of an object, or from its reply to a write."""
+    return {key: result[key] for key in ("e_tag", "version") if result.get(key) is not None}
+
+
 def _out_of_reach(name: str, text: str) -> Offline:
     """Return our error for the text of an obstore error; only parts without secrets are repeated."""
+    if _NO_BUCKET.search(text):
+        return NoBucket(f"{name}: there is no such bucket", status=404)
+    if _NO_TAG in text:
+        return NoTag(f"{name}: the answer has no ETag, is that a store?")
     found = _STATUS.search(text)
     if found is not None:
-        status = found[1] or found[2]
-        hint = _CLOCK if status.startswith("4") else _AGAIN
+        status = int(found[1] or found[2])
+        hint = _CLOCK if 400 <= status < 500 else _AGAIN
         if why := _reason(text):
-            return StoreRefused(f"{name}: refused, {why}", hint=hint, of_credentials=True)
-        return StoreRefused(f"{name}: refused (status {status})", hint=hint)
+            return StoreRefused(f"{name}: refused, {why}", hint=hint, of_credentials=True, status=status)
+        return StoreRefused(f"{name}: refused (status {status})", hint=hint, status=status)
     if "redirect" in text.lower():
         return StoreRefused(f"{name}: refused, it is somewhere else", hint=_REGION)
     if "certificate" in text.lower():
