@@ -40,7 +40,7 @@ def open_store(
     instance_credentials
         Ask the cloud's metadata address for credentials if none are given.
     sole_publisher
-        Write to a bucket without conditions: nobody else publishes there meanwhile.
+        Write to a bucket without conditions: no other program publishes there meanwhile.
 
     Raises
     ------
