@@ -121,6 +121,7 @@ def exit_code_of(name: str, run: Callable[[], int]) -> int:
         sys.stdout.flush()
     except ShmmapError as error:
         complain(name, error.message, error.hint)
+        _leave_requests(error.exit_code)
         return error.exit_code
     except BrokenPipeError:
         _drop_output()
@@ -152,11 +153,12 @@ def exit_code_of(name: str, run: Callable[[], int]) -> int:
             "this is a defect in shmmap: please report it with the lines above",
         )
         return InternalError.exit_code
+    _leave_requests(code)
     return code
 
 
 def _leave_requests(code: object) -> None:
-    """Exit at once if threads still wait for answers of a store, since the interpreter would wait, too."""
+    """Exit at once if threads still wait for answers of a store: the interpreter's own end would not be safe."""
     pools = sys.modules.get("shmmap.processes.request_threads")
     if pools is not None and isinstance(code, int) and pools.requests_under_way():
         sys.stdout.flush()

@@ -8,16 +8,17 @@ from concurrent.futures import ThreadPoolExecutor
 from types import TracebackType
 from typing import Final
 
-__all__ = ["RequestThreads", "requests_under_way"]
+__all__ = ["REQUEST", "RequestThreads", "requests_under_way"]
 
-_PREFIX: Final = "request-"
+REQUEST: Final = "request-"
+"""Prefix of the names of threads with a request."""
 
 
 class RequestThreads(ThreadPoolExecutor):
     """A pool of threads for requests to a store; ``with`` waits for them, but not after an interrupt."""
 
     def __init__(self, threads: int, name: str) -> None:
-        super().__init__(threads, f"{_PREFIX}{name}")
+        super().__init__(threads, f"{REQUEST}{name}")
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -27,5 +28,8 @@ class RequestThreads(ThreadPoolExecutor):
 
 
 def requests_under_way() -> bool:
-    """Whether threads of a pool have not ended: Python would wait for them at its exit."""
-    return any(thread.name.startswith(_PREFIX) for thread in threading.enumerate())
+    """Whether threads with a request have not ended.
+
+    Python would wait at its exit for those of a pool, and be aborted by any that returns from native code then.
+    """
+    return any(thread.name.startswith(REQUEST) for thread in threading.enumerate())

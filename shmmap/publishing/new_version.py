@@ -17,7 +17,14 @@ import msgspec
 
 from shmmap.errors import CannotWrite, error_from_wire
 from shmmap.failpoints import step
-from shmmap.origin.remote.map_versions import CurrentState, Entry, add_version, read_current, refuse_if_signed
+from shmmap.origin.remote.map_versions import (
+    CurrentState,
+    Entry,
+    add_version,
+    read_current,
+    refuse_if_signed,
+    require_served,
+)
 from shmmap.origin.remote.published_object import blob_path
 from shmmap.origin.remote.store import Store
 from shmmap.origin.remote.zstd_frame import pack_frame
@@ -161,11 +168,17 @@ def begin_version(store: Store, signer: MapSigner | None, verb: str) -> CurrentS
     ------
     BadRequest
         The map is signed and there is no signer.
+    CannotWrite
+        The store cannot switch versions safely.
     """
+    store.require_conditions()
     if signer is not None:
-        return signer.begin()
-    refuse_if_signed(store, f"{verb} with the keys that signed it: --sign KEYDIR")
-    return read_current(store)
+        seen = signer.begin()
+    else:
+        refuse_if_signed(store, f"{verb} with the keys that signed it: --sign KEYDIR")
+        seen = read_current(store)
+    store.require_conditions(seen.tag)
+    return seen
 
 
 def refuse_if_late(began_s: float, what: str, hint: str) -> None:
@@ -175,8 +188,12 @@ def refuse_if_late(began_s: float, what: str, hint: str) -> None:
 
 
 def switch_version(store: Store, entry: Entry, seen: CurrentState, signer: MapSigner | None) -> None:
-    """Make an entry's version current; raise `InstanceBusy` if ``seen`` is no longer current."""
+    """Make an entry's version current; raise `InstanceBusy` if ``seen`` is no longer current.
+
+    Then read it back, as a store may say that it did what it did not.
+    """
     if signer is None:
         add_version(store, entry, seen)
     else:
         signer.switch(entry)
+    require_served(store, entry.current)

@@ -53,7 +53,7 @@ from shmmap.origin.remote.signed_metadata import (
     refused,
     target_of,
 )
-from shmmap.origin.remote.store import Store, put_over, refuse_read_only
+from shmmap.origin.remote.store import Store, put_over
 
 __all__ = ["LIFETIMES", "ROOT_FILE", "MapSigner", "Refreshed", "Rotated"]
 
@@ -106,7 +106,7 @@ class MapSigner:
     """
 
     def __init__(self, store: Store, directory: str, *, make_keys: bool = True) -> None:
-        refuse_read_only(store)
+        store.require_conditions()
         self._store = store
         self._directory = os.path.abspath(directory)
         root_file = os.path.join(self._directory, ROOT_FILE)

@@ -212,6 +212,7 @@ def prepare_slice(
     names = tuple(name for name in canonical_layers(layers) if name != LAYER)
     if not names:
         raise BadRequest("name at least one layer", hint="such as --layer 'ndt(leaf=2.0)'")
+    store.require_conditions()
     base = read_base(store, current or require_current(store))
     if len(base.root.layers.keys() | set(names)) > MAX_LAYERS:
         raise BadRequest(f"a published map has at most {MAX_LAYERS} layers")
@@ -307,6 +308,7 @@ class _Slice:
         result = self._result
         path = result.run.part_path(result.slice)
         before, tag = self._part_there(path)
+        self._store.require_conditions(tag)
         if before is not None and self._is_whole(before):
             result.there = True
             self._progress.done(result.cells)

@@ -40,7 +40,7 @@ from shmmap.origin.remote.map_versions import (
 from shmmap.origin.remote.object_tier import KeptObjects, ObjectCounts, ObjectTier, kept_objects
 from shmmap.origin.remote.opened_store import ServedFrom, open_for_serving
 from shmmap.origin.remote.published_index import Root, Shard, unpack_root, unpack_shard
-from shmmap.origin.remote.store import PROBE, ObjectReader, Store
+from shmmap.origin.remote.store import PROBE, NoBucket, ObjectReader, Store
 from shmmap.origin.remote.taken_version import TakenVersion, TakenVersionFile, judge_offer
 from shmmap.origin.remote.verify_apart import Verified, VerifySettings, read_trusted_root, verify_apart
 from shmmap.processes.request_threads import RequestThreads
@@ -178,7 +178,7 @@ class PublishedOrigin:
                 return self._restored(*taken)
             return self._offered(view)
         except Offline as error:
-            if fresh:
+            if fresh or isinstance(error, NoBucket):
                 raise
             # by the exit code, the service manager knows that a later start may succeed
             raise CannotStart(error.message, hint=error.hint) from None

@@ -9,17 +9,29 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Awaitable, Callable, Iterator, Sequence
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
 from datetime import timedelta
+from hashlib import sha256
 from typing import Any, Final, TypeVar
 
 from shmmap.errors import ConfigError, MapDataError, MapMissing, Offline
 from shmmap.lazy_imports import FOR_REMOTE, needed_packages
+from shmmap.origin.remote.conditions import (
+    ASKED,
+    Seen,
+    ask_conditions,
+    asked_content,
+    refuse_foreign,
+    refuse_unsafe_tag,
+)
 from shmmap.origin.remote.credentials import clean_variables, find_credentials
-from shmmap.origin.remote.event_loop import run_coroutine, within
 from shmmap.origin.remote.store import (
     WEB_SCHEMES,
     Listed,
+    NoBucket,
+    NoTag,
     StoreRefused,
     StoreUrl,
     Tag,
@@ -30,10 +42,12 @@ from shmmap.origin.remote.transport import (
     BYTES_PER_S,
     Body,
     answer_limit_s,
+    call_apart,
     host_of,
     is_panic,
     refuse_page,
     refuse_plain_http,
+    too_slow,
     unasked_304,
 )
 
@@ -42,7 +56,7 @@ with needed_packages("a map in a bucket", together=FOR_REMOTE):
     from obstore import exceptions
     from obstore.store import AzureStore, GCSStore, S3Store
 
-__all__ = ["BucketStore", "server_url"]
+__all__ = ["BucketStore", "SolePublisherStore", "server_url"]
 
 _Answer = TypeVar("_Answer")
 
@@ -65,11 +79,6 @@ _TRUE_NAMES: Final = (
         "Content-Length Header missing",
         "its answer has no length",
         f"is it sent in chunks? {BETWEEN}",
-    ),
-    (
-        "ETag Header missing",
-        "its answer has no ETag",
-        BETWEEN,
     ),
     (
         "invalid list response",
@@ -114,7 +123,13 @@ _REASONS: Final = {
     "AccessDenied": "no permission",
 }
 """Meanings of Amazon's error codes, which other stores use, too."""
+_NO_BUCKET: Final = re.compile(
+    r"<Code>(NoSuchBucket|ContainerNotFound)</Code>|The specified (bucket|container) does not exist"
+)
+"""In the answers of Amazon and Google (XML and JSON), and of Azure."""
+_NO_TAG: Final = "ETag Header missing"
 _OBJECTS_PER_PAGE: Final = 1000
+_MAX_LOOK_BYTES: Final = 1 << 16
 
 
 class BucketStore:
@@ -135,6 +150,8 @@ class BucketStore:
         self._timeouts = timeouts
         self._limit_s = timeouts.retry_s + answer_limit_s(timeouts.read_s, 0)
         self._store = _opened(where, timeouts, insecure=insecure_http, instance=instance_credentials)
+        self._asking = threading.Lock()
+        self._is_asked = False
 
     # --- reading --------------------------------------------------------------------------------
 
@@ -160,13 +177,18 @@ class BucketStore:
     def _read(
         self, path: str, max_bytes: int, *, exact: bool = False, unless: str | None = None
     ) -> tuple[memoryview, Tag]:
+        asked = {"if_none_match": unless} if unless else None
+        body, tag = self._answer(path, max_bytes, exact=exact, options=asked)
+        return body.whole(), tag
+
+    def _answer(
+        self, path: str, max_bytes: int, *, exact: bool = False, options: Any = None
+    ) -> tuple[Body, Tag]:
+        """Return the body and the tag of the answer for an object."""
         name = self._name(path)
 
-        async def read() -> tuple[memoryview, Tag]:
-            asked = obstore.get_async(
-                self._store, path, options={"if_none_match": unless} if unless else None
-            )
-            result = await within(name, self._limit_s, asked)
+        def read() -> tuple[Body, Tag]:
+            result = obstore.get(self._store, path, options=options)
             meta, headers = result.meta, result.attributes
             body = Body(
                 name,
@@ -176,18 +198,17 @@ class BucketStore:
                 media_type=str(headers.get("Content-Type", "")),
                 encoding=str(headers.get("Content-Encoding", "")),
             )
-            await within(name, answer_limit_s(self._timeouts.read_s, meta["size"]), _fill(body, result))
-            named = {key: meta[key] for key in ("e_tag", "version") if meta[key] is not None}
-            return body.whole(), named
+            _fill(name, body, result, answer_limit_s(self._timeouts.read_s, meta["size"]))
+            return body, _named(meta)
 
         more_s = answer_limit_s(self._timeouts.read_s, max_bytes)
-        return self._ask(path, read, more_s=more_s, conditional=unless is not None)
+        return self._ask(path, read, more_s=more_s, conditional=options is not None)
 
     def head(self, path: str) -> Listed | None:
         """Return an object's size and time of writing; None if it does not exist."""
 
-        async def head() -> Listed:
-            result = await obstore.get_async(self._store, path, options={"head": True})
+        def head() -> Listed:
+            result = obstore.get(self._store, path, options={"head": True})
             refuse_page(self._name(path), str(result.attributes.get("Content-Type", "")))
             return Listed(path, result.meta["size"], result.meta["last_modified"].timestamp())
 
@@ -198,13 +219,10 @@ class BucketStore:
 
     def list(self, prefix: str) -> Iterator[Listed]:
         """Yield all objects below a prefix."""
-        chunks = obstore.list(self._store, prefix.rstrip("/"), chunk_size=_OBJECTS_PER_PAGE)
+        chunks = iter(obstore.list(self._store, prefix.rstrip("/"), chunk_size=_OBJECTS_PER_PAGE))
 
-        async def next_page() -> Sequence[Any]:
-            try:
-                return await chunks.__anext__()
-            except StopAsyncIteration:
-                return ()
+        def next_page() -> Sequence[Any]:
+            return next(chunks, ())
 
         is_empty = True
         while page := self._ask(prefix, next_page, more_s=_BYTES_PER_PAGE / BYTES_PER_S):
@@ -220,24 +238,26 @@ class BucketStore:
         """Write an object that never changes."""
         self._put(path, data, None, _IMMUTABLE)
 
+    def require_conditions(self, tag: Tag | None = None) -> None:
+        """Ask the store once whether it writes on conditions; see `conditions.ask_conditions`."""
+        with self._asking:
+            if not self._is_asked:
+                ask_conditions(self)
+                self._is_asked = True
+        if tag is not None:
+            refuse_unsafe_tag(self.url, tag)
+
     def put_new(self, path: str, data: bytes) -> bool:
         """Write an object if none exists at this path."""
-        try:
-            self._put(path, data, "create", _CHANGES)
-        except (exceptions.AlreadyExistsError, exceptions.PreconditionError):
-            return self._has(path, data)
-        return True
+        return self.write(path, data, create=True) is not None or self._has(path, data)
 
     def put_if(self, path: str, data: bytes, tag: Tag) -> bool:
         """Replace an object if it is still in the state that ``tag`` names."""
-        wanted = dict(tag)
-        if self._scheme == "s3":
-            wanted["e_tag"] = wanted["e_tag"].strip('"')  # Ceph's gateway needs it bare; Amazon takes both
+        refuse_unsafe_tag(self.url, tag)
         try:
-            self._put(path, data, wanted, _CHANGES)
-        except (exceptions.AlreadyExistsError, exceptions.PreconditionError, MapMissing):
-            return self._has(path, data)
-        return True
+            return self.write(path, data, tag) is not None or self._has(path, data)
+        except MapMissing:
+            return False
 
     def _has(self, path: str, data: bytes) -> bool:
         """Whether an object already has ``data``: the reply to an earlier attempt may have been lost."""
@@ -246,10 +266,32 @@ class BucketStore:
         except (MapMissing, MapDataError):
             return False
 
-    def _put(self, path: str, data: bytes, mode: Any, attributes: dict[str, str]) -> None:
-        self._ask(
+    def write(
+        self, path: str, data: bytes, only_if: Tag | None = None, *, create: bool = False
+    ) -> Tag | None:
+        """Write an object that changes and return its tag; None if a condition is not met."""
+        mode: Any = "create" if create else None
+        if only_if is not None:
+            mode = dict(only_if)
+            if self._scheme == "s3":
+                mode["e_tag"] = mode["e_tag"].strip('"')  # Ceph's gateway needs it bare; Amazon takes both
+        try:
+            return _named(self._put(path, data, mode, _CHANGES))
+        except (exceptions.AlreadyExistsError, exceptions.PreconditionError):
+            return None
+
+    def look(self, path: str) -> Seen:
+        """Return what the store returns for an object; without its bytes if they are many."""
+        try:
+            body, tag = self._answer(path, _MAX_LOOK_BYTES)
+            return Seen(bytes(body.whole()), tag)
+        except MapDataError:
+            return Seen(b"", {})
+
+    def _put(self, path: str, data: bytes, mode: Any, attributes: dict[str, str]) -> Any:
+        return self._ask(
             path,
-            lambda: obstore.put_async(
+            lambda: obstore.put(
                 self._store, path, data, mode=mode, attributes=attributes, use_multipart=False
             ),
             more_s=len(data) / BYTES_PER_S,
@@ -259,7 +301,7 @@ class BucketStore:
     def delete(self, path: str) -> None:
         """Remove an object."""
         try:
-            self._ask(path, lambda: obstore.delete_async(self._store, path))
+            self._ask(path, lambda: obstore.delete(self._store, path))
         except MapMissing:
             return
 
@@ -271,7 +313,7 @@ class BucketStore:
     def _ask(
         self,
         path: str,
-        ask: Callable[[], Awaitable[_Answer]],
+        ask: Callable[[], _Answer],
         *,
         more_s: float = 0.0,
         conditional: bool = False,
@@ -281,22 +323,18 @@ class BucketStore:
         Parameters
         ----------
         ask
-            Begins the request; called in the event loop.
+            Makes the request, in another thread.
         more_s
             Seconds that the request may take beyond those of a small one.
         conditional
             Raise the error of a failed condition unchanged.
         """
         name = self._name(path)
-
-        async def limited() -> _Answer:
-            return await within(name, self._limit_s + more_s, ask())
-
         try:
-            return run_coroutine(limited())
+            return call_apart(ask, name, self._limit_s + more_s)
         except (exceptions.NotFoundError, FileNotFoundError) as error:
-            if "<Code>NoSuchBucket</Code>" in str(error):
-                raise MapMissing(f"{self.url}: there is no such bucket") from None
+            if _NO_BUCKET.search(str(error)):
+                raise NoBucket(f"{name}: there is no such bucket", status=404) from None
             raise MapMissing(f"{name} is not there") from None
         except (exceptions.AlreadyExistsError, exceptions.PreconditionError):
             if conditional:
@@ -327,36 +365,98 @@ def _failure(name: str, error: BaseException) -> Offline:
         return Offline(f"{name}: the request has made the package obstore fail", hint=_PANIC)
     if isinstance(error, exceptions.PermissionDeniedError | exceptions.UnauthenticatedError):
         return StoreRefused(
-            f"{name}: refused, {_reason(text) or 'no permission'}", hint=_CLOCK, of_credentials=True
+            f"{name}: refused, {_reason(text) or 'no permission'}",
+            hint=_CLOCK,
+            of_credentials=True,
+            status=403,
         )
     return _out_of_reach(name, text)
 
 
-async def _fill(body: Body, result: obstore.GetResult) -> None:
+def _fill(name: str, body: Body, result: obstore.GetResult, limit_s: float) -> None:
     """Read the body of an answer; all bytes of objects in buckets come through here."""
+    end_s = time.monotonic() + limit_s
     try:
-        async for piece in result.stream(min_chunk_size=1):
+        for piece in result.stream(min_chunk_size=1):
             body.add(memoryview(piece))
+            if time.monotonic() > end_s and body.lacks:
+                raise too_slow(name, limit_s)
     except (exceptions.BaseError, OSError):
         raise body.cut() from None
 
 
+class SolePublisherStore(BucketStore):
+    """A bucket that is written without conditions: what they would compare is read first.
+
+    If another publisher comes between reading and writing, its version is lost.
+    """
+
+    def require_conditions(self, tag: Tag | None = None) -> None:
+        """Write the small object, and compare what the store returns for it."""
+        del tag
+        with self._asking:
+            if not self._is_asked:
+                data = asked_content()
+                self.write(ASKED, data)
+                if refuse_foreign(self).data != data:
+                    raise StoreRefused(
+                        f"{self._name(ASKED)}: the store has accepted it, and returns another one",
+                        hint="does another program publish there at the same time?",
+                    )
+                self._is_asked = True
+
+    def get_tagged(self, path: str, max_bytes: int) -> tuple[memoryview, Tag]:
+        """Return a whole object, and its hash: the store may give no usable ETag."""
+        data, _ = super().get_tagged(path, max_bytes)
+        return data, {"sha256": sha256(data).digest(), "size": len(data)}
+
+    def put_new(self, path: str, data: bytes) -> bool:
+        """Write an object if there is none."""
+        try:
+            return bytes(self.get(path, len(data))) == data
+        except MapDataError:
+            return False
+        except MapMissing:
+            self.write(path, data)
+        return True
+
+    def put_if(self, path: str, data: bytes, tag: Tag) -> bool:
+        """Replace an object if it still has the hash of ``tag``."""
+        try:
+            _, now = self.get_tagged(path, tag["size"])
+        except (MapMissing, MapDataError):
+            return False
+        if now != tag:
+            return False
+        self.write(path, data)
+        return True
+
+
+def _named(result: Any) -> Tag:
+    """Return the tag from obstore's description of an object, or from its reply to a write."""
+    return {key: result[key] for key in ("e_tag", "version") if result.get(key) is not None}
+
+
 def _out_of_reach(name: str, text: str) -> Offline:
     """Return our error for the text of an obstore error; only parts without secrets are repeated."""
+    if _NO_BUCKET.search(text):
+        return NoBucket(f"{name}: there is no such bucket", status=404)
     if _NOWHERE in text or "redirect" in text.lower() or _MOVED.search(text):
         return StoreRefused(f"{name}: refused, it is somewhere else", hint=_REGION)
     if _UNASKED.search(text):
         return unasked_304(name)
+    if _NO_TAG in text:
+        return NoTag(f"{name}: its answer has no ETag", hint=BETWEEN)
     for part, says, hint in _TRUE_NAMES:
         if part in text:
             return StoreRefused(f"{name}: {says}", hint=hint)
     found = _STATUS.search(text)
     if found is not None:
-        status = found[1] or found[2]
-        hint = _CLOCK if status.startswith("4") else _AGAIN
+        status = int(found[1] or found[2])
+        hint = _CLOCK if 400 <= status < 500 else _AGAIN
         if why := _reason(text):
-            return StoreRefused(f"{name}: refused, {why}", hint=hint, of_credentials=True)
-        return StoreRefused(f"{name}: refused (status {status})", hint=hint)
+            return StoreRefused(f"{name}: refused, {why}", hint=hint, of_credentials=True, status=status)
+        return StoreRefused(f"{name}: refused (status {status})", hint=hint, status=status)
     if "certificate" in text.lower():
         return StoreRefused(f"{name}: the server's certificate is not accepted", hint=_CERTIFICATE)
     in_time = " in time" if "kind: Timeout" in text else ""

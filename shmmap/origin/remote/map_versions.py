@@ -22,7 +22,7 @@ from shmmap.errors import BadRequest, InstanceBusy, MapDataError, MapMissing
 from shmmap.failpoints import step
 from shmmap.origin.remote.published_index import MAX_ROOT_BYTES, Root, Shard, unpack_root, unpack_shard
 from shmmap.origin.remote.published_object import blob_path
-from shmmap.origin.remote.store import ObjectReader, Store, Tag, put_over
+from shmmap.origin.remote.store import ObjectReader, Store, StoreRefused, Tag, put_over
 from shmmap.origin.remote.zstd_frame import DAMAGED
 from shmmap.processes.request_threads import RequestThreads
 
@@ -49,6 +49,7 @@ __all__ = [
     "read_shards",
     "refuse_if_signed",
     "require_current",
+    "require_served",
     "root_path",
     "unpack_current",
 ]
@@ -290,6 +291,28 @@ def add_version(store: Store, entry: Entry, seen: CurrentState) -> None:
     if not put_over(store, CURRENT, data, seen.tag):
         raise changed_meanwhile(store)
     step("version.switched")
+
+
+def require_served(store: Store, made: Current) -> None:
+    """Raise an error if a version that was just made current is not among those that the store returns.
+
+    Raises
+    ------
+    InstanceBusy
+        Another publisher's version is in its place.
+    StoreRefused
+        The store says that it has written the version, and returns what it had before.
+    """
+    current = read_current(store).current
+    if current is None or current.version < made.version:
+        raise StoreRefused(
+            f"{store.url}: the store has accepted version {made.version}, and does not return it",
+            hint="run the same command again: what was sent is not sent again",
+        )
+    entries = (entry.current for entry in earlier_versions(store, current))
+    found = next((named for named in entries if named.version <= made.version), None)
+    if found != made or (current.version == made.version and current != made):
+        raise changed_meanwhile(store)
 
 
 def changed_meanwhile(store: Store) -> InstanceBusy:

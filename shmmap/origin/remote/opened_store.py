@@ -29,6 +29,7 @@ def open_store(
     timeouts: Timeouts = LONG_RUN,
     insecure_http: bool = False,
     instance_credentials: bool = False,
+    sole_publisher: bool = False,
 ) -> Store:
     """Return the store at a URL or in a directory, without a first request.
 
@@ -38,6 +39,8 @@ def open_store(
         Allow plain ``http://`` to other machines.
     instance_credentials
         Ask the cloud's metadata address for credentials if none are given.
+    sole_publisher
+        Write to a bucket without conditions: no other program publishes there meanwhile.
 
     Raises
     ------
@@ -55,9 +58,10 @@ def open_store(
         from shmmap.origin.remote.web_server import WebServer
 
         return WebServer(where, timeouts=timeouts, insecure_http=insecure_http)
-    from shmmap.origin.remote.bucket_store import BucketStore
+    from shmmap.origin.remote.bucket_store import BucketStore, SolePublisherStore
 
-    return BucketStore(
+    kind = SolePublisherStore if sole_publisher else BucketStore
+    return kind(
         where, timeouts=timeouts, insecure_http=insecure_http, instance_credentials=instance_credentials
     )
 
@@ -165,6 +169,9 @@ class DirectoryStore:
                 with suppress(Offline):
                     if (found := self.head(path)) is not None:
                         yield found
+
+    def require_conditions(self, tag: Tag | None = None) -> None:
+        """Do nothing: a directory compares and replaces under a lock."""
 
     def put(self, path: str, data: bytes) -> None:
         """Write a file."""

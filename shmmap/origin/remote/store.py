@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple, Protocol, TypeAlias
 from urllib.parse import urlsplit
 
-from shmmap.errors import BadRequest, Offline
+from shmmap.errors import BadRequest, MapMissing, Offline
 
 __all__ = [
     "BUCKET_SCHEMES",
@@ -23,6 +23,8 @@ __all__ = [
     "SERVING",
     "WEB_SCHEMES",
     "Listed",
+    "NoBucket",
+    "NoTag",
     "ObjectReader",
     "Store",
     "StoreRefused",
@@ -50,12 +52,26 @@ class StoreRefused(Offline):
     """The store answered with a refusal.
 
     ``of_credentials``: the reason is the account or its credentials.  If an account may not list objects, a
-    store also gives this reply for an object that does not exist.
+    store also gives this reply for an object that does not exist.  ``status``: that of HTTP; 0: none.
     """
 
-    def __init__(self, message: str, *, hint: str = "", of_credentials: bool = False) -> None:
+    def __init__(
+        self, message: str, *, hint: str = "", of_credentials: bool = False, status: int = 0
+    ) -> None:
         super().__init__(message, hint=hint)
         self.of_credentials = of_credentials
+        self.status = status
+
+
+class NoBucket(StoreRefused):
+    """There is no such bucket; what would be in it is not merely missing."""
+
+    exit_code = MapMissing.exit_code
+    advice = "make the bucket first, or correct its name"
+
+
+class NoTag(StoreRefused):
+    """The store has answered without an ETag, so it is not known what it has done."""
 
 
 class Listed(NamedTuple):
@@ -120,6 +136,22 @@ class Store(ObjectReader, Protocol):
 
     def list(self, prefix: str) -> Iterator[Listed]:
         """Yield all objects whose path begins with ``prefix``, which ends with ``/``, in any order."""
+
+    def require_conditions(self, tag: Tag | None = None) -> None:
+        """Raise an error if `put_new` or `put_if` cannot keep their promise; publishers call it first.
+
+        Parameters
+        ----------
+        tag
+            Tag of an object that is to be replaced.
+
+        Raises
+        ------
+        BadRequest
+            The store is read-only.
+        CannotWrite
+            The store ignores or refuses conditions, or the tag cannot be used for one.
+        """
 
     def put(self, path: str, data: bytes) -> None:
         """Write an object that is named by its content; an existing object is overwritten."""

@@ -2,21 +2,23 @@
 """How long an answer of a store may take, how large it may be, and what is said of one that is wrong.
 
 A limit for each read alone would let a server that sends a byte a second hold a request for hours.  So each
-whole answer has one: ``read_s`` and a second for every 64 KiB of it.  Requests to buckets run in an event
-loop in a thread of its own, which can end them; requests to web servers watch the clock at each read.  A main
-thread that waits for either still handles signals.
+whole answer has one: ``read_s`` and a second for every 64 KiB of it.  Bodies are read against the clock; what
+a library does before and after runs in a thread that is left alone when its time is over.  A main thread that
+waits for either still handles signals.
 """
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from typing import Final, NoReturn, TypeVar
 
 from shmmap.errors import BadRequest, MapDataError, Offline
 from shmmap.origin.remote.store import WEB_SCHEMES, StoreRefused, StoreUrl, is_loopback
 from shmmap.origin.remote.zstd_frame import DAMAGED
+from shmmap.processes.request_threads import REQUEST
 
 __all__ = [
     "BETWEEN",
@@ -178,20 +180,30 @@ def is_panic(error: BaseException) -> bool:
 # --- waiting ------------------------------------------------------------------------------------------
 
 
-def call_apart(call: Callable[[], _Answer]) -> _Answer:
-    """Call a function that may block; in the main thread such that signals are handled meanwhile.
+def call_apart(call: Callable[[], _Answer], name: str = "", limit_s: float = math.inf) -> _Answer:
+    """Call a function that may block; the main thread still handles signals meanwhile.
 
-    After an exception of a signal handler, the call goes on in its thread until it ends.
+    After the limit, or an exception of a signal handler, the call goes on in a thread until it ends.
+
+    Raises
+    ------
+    Offline
+        The request called ``name`` has not ended within its limit, or the system allows no more threads.
     """
-    if threading.current_thread() is not threading.main_thread():
+    if math.isinf(limit_s) and threading.current_thread() is not threading.main_thread():
         return call()
     future: Future[_Answer] = Future()
 
     def run() -> None:
         try:
             future.set_result(call())
-        except BaseException as error:  # noqa: BLE001  raised in the main thread
+        except BaseException as error:  # noqa: BLE001  raised in the thread that waits
             future.set_exception(error)
 
-    threading.Thread(target=run, name="request", daemon=True).start()
+    try:
+        threading.Thread(target=run, name=f"{REQUEST}apart", daemon=True).start()
+    except RuntimeError:
+        raise Offline(f"{name}: no request can be made: the system allows no more threads") from None
+    if not wait([future], None if math.isinf(limit_s) else limit_s).done:
+        raise too_slow(name, limit_s)
     return future.result()

@@ -292,7 +292,7 @@ class WebServer:
         """Raise `BadRequest`: a web server can neither be listed nor written."""
         raise BadRequest(f"{self.url}: {self.read_only}")
 
-    list = put = put_new = put_if = delete = _refuse
+    list = require_conditions = put = put_new = put_if = delete = _refuse
 
     # --- requests -------------------------------------------------------------------------------
 

@@ -26,6 +26,7 @@ __all__ = [
     "URL_HELP",
     "add_map_options",
     "add_sign_option",
+    "add_sole_publisher_option",
     "add_store_options",
     "add_trust_option",
     "cache_directory",
@@ -130,6 +131,16 @@ def add_store_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_sole_publisher_option(parser: argparse.ArgumentParser) -> None:
+    """Add the option for stores that do not write on conditions."""
+    parser.add_argument(
+        "--sole-publisher",
+        action="store_true",
+        help="publish although the store may not write on conditions: of two programs that publish there at"
+        " once, one may lose its version without a word",
+    )
+
+
 def store_at(url: str, args: argparse.Namespace) -> Store:
     """Open the store at a URL with the options."""
     with needed_packages("a published map"):
@@ -137,7 +148,12 @@ def store_at(url: str, args: argparse.Namespace) -> Store:
         from shmmap.origin.remote.store import may_be_plain
 
         plain = may_be_plain(url, insecure_http=args.insecure_http, trust=getattr(args, "trust", None))
-        return open_store(url, insecure_http=plain, instance_credentials=args.instance_credentials)
+        return open_store(
+            url,
+            insecure_http=plain,
+            instance_credentials=args.instance_credentials,
+            sole_publisher=getattr(args, "sole_publisher", False),
+        )
 
 
 def add_sign_option(parser: argparse.ArgumentParser) -> None:

@@ -29,6 +29,7 @@ from shmmap.cli.screens.output import (
 )
 from shmmap.cli.verbs.maps.map_options import (
     add_map_options,
+    add_sole_publisher_option,
     add_store_options,
     add_trust_option,
     cache_directory,
@@ -56,8 +57,8 @@ With --shards MAP is the URL of a published map: the layers of slice I of N are 
 any machine, in any order; 1/1 is all of it.  When all slices are made, `shmmap publish URL --join RUN` adds
 the layers to the map.
 Exit code: 0, 1 if a layer of some cell could not be computed (the slice is then not made), 2 wrong usage,
-65 bad map, 66 no map, 69 a package is missing, 73 nothing can be kept in the cache directory, 75 the store
-does not answer or refuses, 78 unusable credentials."""
+65 bad map, 66 no map, 69 a package is missing, 73 nothing can be kept in the cache directory, or the store
+does not write on conditions, 75 the store does not answer or refuses, 78 unusable credentials."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -94,6 +95,7 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
     add_trust_option(parser)
     add_store_options(parser)
+    add_sole_publisher_option(parser)
     add_json_option(parser)
 
 
@@ -120,6 +122,8 @@ def run(args: argparse.Namespace) -> int:
         )
     if args.trust is not None:
         raise BadRequest("--trust goes with --shards")
+    if args.sole_publisher:
+        raise BadRequest("--sole-publisher goes with --shards")
     return _prepare_map(args)
 
 

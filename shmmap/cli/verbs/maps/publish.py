@@ -30,6 +30,7 @@ from shmmap.cli.screens.output import (
 from shmmap.cli.verbs.maps.map_options import (
     add_map_options,
     add_sign_option,
+    add_sole_publisher_option,
     add_store_options,
     cache_directory,
     failure_rows,
@@ -51,6 +52,8 @@ __all__ = ["add_parser", "run"]
 _EPILOG = """\
 URL is s3://BUCKET/PATH, gs://BUCKET/PATH, az://CONTAINER/PATH, file:///DIR or a directory, which any web
 server can serve.  Credentials come from the environment, from $CREDENTIALS_DIRECTORY, or from a profile.
+The store is asked first whether it writes on conditions, by four small writes: of two publishers at once,
+one must be refused.  --sole-publisher does without.
 Only what the current version does not have is sent.  The new version becomes current at once, at the end; a
 stopped run, started again, sends only what is missing.
 --sign: keys are made in KEYDIR at first; give ROOT.json to vehicles, take root.pem offline, and have the
@@ -58,9 +61,9 @@ map signed again within 7 days: `shmmap versions URL --refresh --sign KEYDIR`.
 `shmmap publish URL --join RUN` adds the layers that `shmmap prepare URL --shards I/N` has made to the current
 version; all slices have to be there.
 Exit code: 0, 1 if a layer of some cell cannot be made (nothing is published then), 2 wrong usage, 65 bad map
-or damaged version, 66 no map or bucket, or slices are missing, 69 a package is missing, 73 cannot write,
-75 the store does not answer or refuses, or another publisher was quicker, 78 unusable credentials or
-keys."""
+or damaged version, 66 no map or bucket, or slices are missing, 69 a package is missing, 73 cannot write, or
+the store cannot switch versions safely, 75 the store does not answer or refuses, or another publisher was
+quicker, 78 unusable credentials or keys."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -110,6 +113,7 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
     add_sign_option(parser)
     add_store_options(parser)
+    add_sole_publisher_option(parser)
     add_json_option(parser)
 
 

@@ -25,6 +25,7 @@ from shmmap.cli.screens.output import (
 from shmmap.cli.verbs.maps.map_options import (
     URL_HELP,
     add_sign_option,
+    add_sole_publisher_option,
     add_store_options,
     add_trust_option,
     cache_directory,
@@ -48,8 +49,8 @@ _VERSIONS_EPILOG = """\
 --rollback gives an old version's content a new number: vehicles never go back to a lower one.
 With a web server, versions that were never served cannot be listed.
 Exit code: 0, 2 wrong usage, 65 damaged or --trust refuses, 66 no such map or version, 69 a package is
-missing, 75 the store does not answer or refuses, or another publisher was quicker, 78 unusable
-credentials or keys."""
+missing, 73 the store cannot switch versions safely, 75 it does not answer or refuses, or another
+publisher was quicker, 78 unusable credentials or keys."""
 
 
 def add_versions(subparsers: Subparsers) -> None:
@@ -96,6 +97,7 @@ def add_versions(subparsers: Subparsers) -> None:
     add_sign_option(parser)
     add_trust_option(parser)
     add_store_options(parser)
+    add_sole_publisher_option(parser)
     add_json_option(parser)
 
 
@@ -121,6 +123,8 @@ def run_versions(args: argparse.Namespace) -> int:
         raise BadRequest("--trust goes with the list of versions alone")
     if args.refresh and args.sign is None:
         raise BadRequest("--refresh needs the directory with online.pem and ROOT.json", hint="--sign KEYDIR")
+    if args.sole_publisher and not (args.refresh or args.rollback or args.rotate):
+        raise BadRequest("--sole-publisher goes with --refresh, --rollback or --rotate")
     store = store_at(args.url, args)
     signer = signer_at(store, args)
     unit = "objects" if args.prune else "cells"

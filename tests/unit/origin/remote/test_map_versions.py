@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from shmmap.errors import MapDataError, MapMissing
+from shmmap.errors import InstanceBusy, MapDataError, MapMissing
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 
@@ -24,10 +24,11 @@ from shmmap.origin.remote.map_versions import (
     read_current,
     read_entry,
     require_current,
+    require_served,
     unpack_current,
 )
 from shmmap.origin.remote.opened_store import open_store
-from shmmap.origin.remote.store import Store
+from shmmap.origin.remote.store import Store, StoreRefused
 
 ROOT = "0123456789abcdef" * 4
 
@@ -77,6 +78,34 @@ def test_an_entry_that_was_never_served_is_beside_the_chain(store: Store) -> Non
     assert published(store).version == 3
     assert [one.version for one in earlier_versions(store, require_current(store))] == [3, 1]
     assert list_entries(store) == [1, 2, 3]
+
+
+def test_a_version_is_read_back(store: Store) -> None:
+    """Also where others have followed; not where a store has lost it, or had another's in its place."""
+    with pytest.raises(StoreRefused, match="has accepted version 1, and does not return it"):
+        require_served(store, Current(1, ROOT, 100))
+    made = published(store).current
+    require_served(store, made)
+    with pytest.raises(StoreRefused, match="has accepted version 2"):
+        require_served(store, Current(2, ROOT, 100))
+    for _ in range(3):
+        published(store, "f" * 64)
+    require_served(store, made)
+    other = Current(4, ROOT, 100)
+    for name, data in (
+        ("CURRENT", pack_json(other)),  # a version of the same number has replaced it
+        ("versions/4.json", pack_json(Entry(4, ROOT, 100, "2026-11-26T15:00:00.000001Z", before=3))),
+    ):
+        kept = bytes(store.get(name, 999))
+        store.put(name, data)
+        with pytest.raises(InstanceBusy, match="another publisher has changed"):
+            require_served(store, Current(4, "f" * 64, 100))
+        store.put(name, kept)
+    require_served(store, Current(4, "f" * 64, 100))
+    store.put("versions/3.json", pack_json(Entry(3, ROOT, 100, "2026-11-26T15:00:00.000001Z", before=1)))
+    for lost in (Current(2, "f" * 64, 100), Current(3, "f" * 64, 100)):
+        with pytest.raises(InstanceBusy):
+            require_served(store, lost)
 
 
 def test_other_files_among_the_entries_are_left_alone(store: Store) -> None:

@@ -131,15 +131,6 @@ def test_objects_in_buckets_say_how_long_they_may_be_kept(buckets: BucketServer)
     assert found == {"blobs/sha256/aa": "public, max-age=31536000, immutable", "CURRENT": "no-cache"}
 
 
-def test_a_bucket_that_is_not_there(buckets: BucketServer) -> None:
-    store = open_store("s3://no-such-bucket/map", timeouts=ONCE)
-    with pytest.raises(MapMissing, match="there is no such bucket"):
-        store.put("blobs/sha256/aa", b"")
-    with pytest.raises(MapMissing, match="there is no such bucket"):
-        store.put_new("CURRENT", b"")
-    del buckets
-
-
 # --- directories --------------------------------------------------------------------------------------
 
 
