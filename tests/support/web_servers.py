@@ -132,6 +132,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         """Answer."""
         web = self.server.web
         path = self.path.lstrip("/")
+        self.rfile.read(int(self.headers.get("Content-Length", "0")))
         fault = web.fault(path)
         if fault == "stall":
             web.until_healed()

@@ -179,14 +179,18 @@ class _Server:
     """One server and its idle connections."""
 
     def __init__(self, url: str, timeouts: Timeouts) -> None:
+        self._idle: list[_Connection] = []
+        self._lock = threading.Lock()
         parts = urllib.parse.urlsplit(url)
         self.timeouts = timeouts
         self.origin = _origin_of(url)
         self.address = parts.hostname or "", parts.port or (443 if parts.scheme == "https" else 80)
         self.tls = ssl.create_default_context() if parts.scheme == "https" else None
         self.proxy, self.proxy_headers = _proxy_for(parts)
-        self._idle: list[_Connection] = []
-        self._lock = threading.Lock()
+
+    def __del__(self) -> None:
+        for connection in self._idle:
+            connection.close()
 
     def connection(self) -> tuple[_Connection, bool]:
         """Return a connection, and whether it was used before."""

@@ -121,6 +121,25 @@ def test_layers_get_their_share_of_loaders_that_points_keep_busy() -> None:
         assert (first.layers, second.layers) == (2, 0)
 
 
+def test_a_loader_that_waits_for_data_in_vain_gets_more_places() -> None:
+    with subprocess.Popen(["cat"], stdin=subprocess.PIPE) as process, jobs(1, places=3) as one:
+        while one.give():
+            pass
+        (worker,) = one.pool
+        one.pool.begun(worker, process.pid, os.pidfd_open(process.pid), 0.0)  # which the pool kills
+        assert 0 < one.pool.next_deadline_s() < 2
+        one.pool.make_places(0.1)
+        assert not one.give(), "it may just be about to get its data"
+        one.pool.make_places(one.pool.next_deadline_s())
+        assert [one.give() for _ in range(4)] == [True, True, True, False]
+        assert one.pool.next_deadline_s() == 30.0, "once"
+        one.pool.works_on(worker, 1, 2.0)
+        while len(worker.queue) >= 3:
+            one.done(worker)
+        one.pool.make_places(2.0)
+        assert one.pool.free_places == 1
+
+
 def test_of_loaders_that_fetch_a_second_one_starts_when_the_first_is_full() -> None:
     with jobs(2, places=3) as one:
         for free in (6, 5, 4, 3, 2, 1):

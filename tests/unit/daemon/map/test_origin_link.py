@@ -19,7 +19,7 @@ class Origin:
     """Answers as the test says; counts questions."""
 
     def __init__(self) -> None:
-        self.answer: bool | Exception = False
+        self.answer: bool | BaseException = False
         self.asked_s: list[float] = []
         self.may_answer = threading.Event()
         self.may_answer.set()
@@ -32,7 +32,7 @@ class Origin:
     def ask(self) -> bool:
         self.asked_s.append(time.monotonic())
         self.may_answer.wait()
-        if isinstance(self.answer, Exception):
+        if isinstance(self.answer, BaseException):
             raise self.answer
         return self.answer
 
@@ -125,3 +125,38 @@ def test_without_a_reason_nothing_is_asked_and_no_thread_runs(origin: Origin) ->
     threads = threading.active_count()
     origin.link()
     assert threading.active_count() == threads
+
+
+class Panic(BaseException):
+    """What a library in Rust raises: no `Exception`."""
+
+
+def test_a_panic_does_not_end_the_polling(origin: Origin) -> None:
+    link = origin.link(poll_s=0.01)
+    news(link)
+    origin.answer = Panic()
+    while not link.is_out:
+        news(link)
+    assert not link.is_lost
+    origin.answer = True
+    while not news(link).back:
+        pass
+    assert not link.is_out
+
+
+def test_a_thread_that_has_ended_is_missed_and_started_again(
+    origin: Origin, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(OriginLink, "_run", lambda _self: None)
+    link = origin.link(poll_s=0.01)
+    waiting = Deadline()
+    while waiting(not link.is_lost):
+        pass
+    monkeypatch.undo()
+    link.restart()
+    assert link.is_out, "until it is known better"
+    assert news(link)
+    while link.is_out:
+        news(link)
+    assert not link.is_lost
+    assert origin.asked

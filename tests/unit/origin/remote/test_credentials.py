@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from shmmap.errors import ConfigError
-from shmmap.origin.remote.credentials import credentials_source, find_credentials
+from shmmap.origin.remote.credentials import clean_variables, credentials_source, find_credentials
 
 SECRET = "hunter2"
 ANONYMOUS = {"region": "us-east-1", "skip_signature": True}
@@ -202,3 +203,55 @@ def test_sources_are_named_and_nothing_else(home: Path, monkeypatch: pytest.Monk
     assert (
         credentials_source("s3", {}, instance=True) == "the cloud's metadata address (instance_credentials)"
     )
+
+
+# --- characters that no request can contain ----------------------------------------------------------
+
+SPOILT = {
+    "\n": "a line break",
+    "\r\n": "a line break",
+    "\t": "a tabulator",
+    "\x00": "U+0000",
+    "\u200b": "U+200B",
+}
+
+
+def refused(find: Callable[[], object], name: str, says: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        find()
+    assert name in caught.value.message
+    assert says in caught.value.message
+    assert SECRET not in str(caught.value)
+    assert caught.value.exit_code == 78
+
+
+@pytest.mark.parametrize("character", SPOILT)
+def test_a_value_with_a_line_break_is_refused_by_the_name_of_its_place(home: Path, character: str) -> None:
+    says, value = SPOILT[character], f"{SECRET}{character}{SECRET}"
+    keys = {"AWS_ACCESS_KEY_ID": "a", "AWS_SECRET_ACCESS_KEY": "b", "AWS_SESSION_TOKEN": "c"}
+    for name in (*keys, "AWS_REGION", "AWS_ENDPOINT_URL"):
+        refused(lambda name=name: s3({**keys, name: value}), name, says)
+    for name in ("AZURE_STORAGE_ACCOUNT_KEY", "AZURE_STORAGE_SAS_TOKEN", "AZURE_CLIENT_SECRET"):
+        refused(lambda name=name: azure({name: value}), name, says)
+    token = home / "token"
+    token.write_text(value, newline="")
+    for name in ("AWS_WEB_IDENTITY_TOKEN_FILE", "AWS_CONTAINER_AUTHORIZATION_TOKEN_FILE"):
+        refused(lambda name=name: s3({name: str(token)}, instance=True), str(token), says)
+    if character == "\u200b":
+        profile(home / ".aws/credentials", aws_session_token=value)
+        refused(lambda: s3({}), "aws_session_token", says)
+        (home / "shmmap.azure").write_text(f"AZURE_STORAGE_ACCOUNT_KEY={value}\n")
+        refused(lambda: azure({"CREDENTIALS_DIRECTORY": str(home)}), "AZURE_STORAGE_ACCOUNT_KEY", says)
+
+
+def test_white_space_around_a_value_is_left_out(home: Path) -> None:
+    token = home / "token"
+    token.write_text(f"{SECRET}\n")
+    environment = {
+        "AWS_ACCESS_KEY_ID": "a\n", "AWS_SECRET_ACCESS_KEY": " b\r\n", "AWS_SESSION_TOKEN": "c\n",
+        "AWS_REGION": "eu\n", "AWS_WEB_IDENTITY_TOKEN_FILE": str(token), "AWS_PROMPT": "\x1b[1m",
+    }  # fmt: skip
+    assert s3(environment) == {"access_key_id": "a", "secret_access_key": "b", "session_token": "c"}
+    assert clean_variables(environment)["AWS_REGION"] == "eu"
+    assert azure({"AZURE_STORAGE_SAS_TOKEN": "sv=1\n"}) == {"sas_key": "sv=1"}
+    assert google({"GOOGLE_SERVICE_ACCOUNT_KEY": '{\n  "type": "service_account"\n}\n'}) == {}

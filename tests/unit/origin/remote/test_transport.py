@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Wrong answers of stores: each ends at its limit, under its true name, and no other host is asked."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from shmmap.errors import ConfigError, Offline, ShmmapError
+from tests.support.web_servers import WRONG_ANSWERS, FaultyWeb, faulty_web
+
+pytest.importorskip("obstore", reason="obstore is not installed")
+pytest.importorskip("zstandard", reason="zstandard is not installed")
+
+from shmmap.origin.remote.map_versions import refuse_if_signed
+from shmmap.origin.remote.opened_store import open_store
+from shmmap.origin.remote.store import Store, Timeouts
+
+ONCE = Timeouts(connect_s=5.0, read_s=0.5, retries=0, retry_s=0.0)
+AGAIN = Timeouts(connect_s=5.0, read_s=5.0, retries=4, retry_s=60.0)
+TEXT = b'{"version": 1, "root": "ab", "bytes": 12}'
+SECRET = "of-the-session"
+
+
+@pytest.fixture
+def other() -> Iterator[FaultyWeb]:
+    """Another server, which must not be asked for anything."""
+    with faulty_web(lambda _path: TEXT) as server:
+        yield server
+
+
+@pytest.fixture
+def web(monkeypatch: pytest.MonkeyPatch) -> Iterator[FaultyWeb]:
+    """A server whose answers are wrong in the way that the last part of the path names."""
+    for name, value in {
+        "AWS_ACCESS_KEY_ID": "key", "AWS_SECRET_ACCESS_KEY": "secret", "AWS_SESSION_TOKEN": SECRET,
+        "AWS_REGION": "us-east-1",
+    }.items():  # fmt: skip
+        monkeypatch.setenv(name, value)
+    with faulty_web(lambda _path: TEXT) as server:
+        monkeypatch.setenv("AWS_ENDPOINT_URL", server.url)
+        server.fault = lambda path: path.rpartition("/")[2].replace("%20", " ")
+        yield server
+
+
+def opened(web: FaultyWeb, scheme: str, timeouts: Timeouts = ONCE) -> Store:
+    return open_store("s3://maps/m" if scheme == "s3" else f"{web.url}/m", timeouts=timeouts)
+
+
+def outcome(ask: Callable[[], object]) -> str:
+    try:
+        return repr(ask())
+    except ShmmapError as error:
+        return f"{type(error).__name__}: {error.message}"
+
+
+SLOW = "the answer was not complete within"
+CUT = "the answer ended after 20"
+PAGE = "what the store answers is no map: a page"
+NO_LENGTH = "its answer has no length"
+READ = repr(TEXT)
+READ_OF = {
+    "drip head": (SLOW, "no answer in time"), "continue": (SLOW, "no answer in time"),
+    "drip body": (SLOW, SLOW), "drip error": ("refused (status 503)", SLOW),
+    "drip chunks": (SLOW, NO_LENGTH), "endless": ("or more, at most 99 are read", NO_LENGTH),
+    "chunked": (READ, NO_LENGTH), "chunked cut": (CUT, NO_LENGTH), "no length": (READ, NO_LENGTH),
+    "cut": (f"{CUT} of 41 bytes", f"{CUT} of 41 bytes"),
+    "gzip": ("compressed ('gzip')", "compressed ('gzip')"),
+    "page": (f"{PAGE} (text/html)", f"{PAGE} (text/html)"),
+    "page of no type": (f"{PAGE} (of no stated type)", f"{PAGE} (of no stated type)"),
+    "not modified": ("status 304: not modified", "status 304: not modified"),
+    "partial": ("refused (status 206)", repr(TEXT[:5])), "no HTTP": ("is no HTTP", "is no HTTP"),
+    "closed": ("no answer", "no answer"),
+}  # fmt: skip
+"""What is said when an object is read from a web server, and from a bucket."""
+
+
+@pytest.mark.parametrize("scheme", ["http", "s3"])
+def test_each_wrong_answer_ends_under_its_name(web: FaultyWeb, scheme: str) -> None:
+    assert READ_OF.keys() == WRONG_ANSWERS.keys()
+    store = opened(web, scheme)
+    with ThreadPoolExecutor(len(READ_OF)) as threads:
+        found = threads.map(lambda fault: outcome(lambda: bytes(store.get(fault, 99))), READ_OF)
+        for fault, says in zip(READ_OF, found, strict=True):
+            assert READ_OF[fault][scheme == "s3"] in says, (fault, says)
+            assert "internal" not in says.lower()
+            assert SECRET not in says
+
+
+@pytest.mark.parametrize("scheme", ["http", "s3"])
+def test_a_page_is_no_object_of_any_size(web: FaultyWeb, scheme: str) -> None:
+    store = opened(web, scheme)
+    for fault in ("page", "page of no type"):
+        assert PAGE in outcome(lambda name=fault: store.get_exactly(name, 4000))
+        assert PAGE in outcome(lambda name=fault: store.get_exactly(name, 7))
+    assert PAGE in outcome(lambda: store.head("page"))
+    web.fault = lambda _path: "page of no type"
+    assert PAGE in outcome(lambda: refuse_if_signed(store, ""))
+
+
+def test_a_bucket_s_other_answers_have_their_names(web: FaultyWeb) -> None:
+    store = opened(web, "s3")
+    web.fault = lambda _path: fault
+    for fault, says in (("page", PAGE), ("gzip", "no listing"), ("chunked cut", "its listing ended early")):
+        assert says in outcome(lambda: list(store.list("versions/"))), fault
+    for fault, says in (("page", "no ETag"), ("continue", "no answer in time"), ("drip error", SLOW)):
+        assert says in outcome(lambda: store.put("blobs/sha256/aa", b"1")), fault
+
+
+@pytest.mark.parametrize(
+    ("scheme", "to"),  # of a bucket, redirects to another port of the same host cannot be refused
+    [("http", "http://127.0.0.1"), *((scheme, to) for scheme in ("http", "s3") for to in
+     ("http://localhost", "https://localhost"))],
+)  # fmt: skip
+def test_redirects_to_other_servers_are_refused(
+    web: FaultyWeb, other: FaultyWeb, scheme: str, to: str
+) -> None:
+    port = other.url.rpartition(":")[2]
+    web.fault = lambda _path: f"redirect {to}:{port}"
+    store = opened(web, scheme)
+    asks: list[Callable[[], object]] = [lambda: store.get("CURRENT", 99), lambda: store.head("CURRENT")]
+    if scheme == "s3":
+        asks += [lambda: store.put("CURRENT", b"1"), lambda: list(store.list("versions/"))]
+    for ask in asks:
+        assert "refused, it is somewhere else" in outcome(ask)
+    assert other.requests() == []
+    assert not other.connections
+
+
+def test_redirects_within_a_web_server_are_followed_to_their_end(web: FaultyWeb) -> None:
+    web.fault = lambda path: f"redirect {web.url}/new" if not path.startswith("new/") else ""
+    assert bytes(opened(web, "http").get("CURRENT", 99)) == TEXT
+    assert web.requests() == [("m/CURRENT", 302), ("new/m/CURRENT", 200)]
+    web.fault = lambda _path: f"redirect {web.url}"
+    assert "its redirects do not end" in outcome(lambda: opened(web, "http").get("CURRENT", 99))
+
+
+def test_a_body_that_was_cut_is_gone_on_with(web: FaultyWeb) -> None:
+    web.fault = lambda _path: "stall body"
+    store = opened(web, "http", Timeouts(connect_s=5.0, read_s=0.3, retries=4, retry_s=60.0))
+    assert bytes(store.get("CURRENT", 99)) == TEXT
+    assert [status for _, status in web.requests()] == [200, 206]
+
+
+def test_an_idle_connection_that_was_closed_is_no_failure(web: FaultyWeb) -> None:
+    store = opened(web, "http")
+    assert bytes(store.get("m", 99)) == TEXT
+    web.refuse()
+    web.listen()
+    assert bytes(store.get("m", 99)) == TEXT
+
+
+@pytest.mark.parametrize("scheme", ["http", "s3"])
+def test_what_fails_for_a_moment_is_asked_again(web: FaultyWeb, scheme: str) -> None:
+    failing = iter(["503", "500", "closed"])
+    web.fault = lambda _path: next(failing, "")
+    assert bytes(opened(web, scheme, AGAIN).get("CURRENT", 99)) == TEXT
+
+
+def test_a_proxy_of_the_environment_is_used(
+    web: FaultyWeb, other: FaultyWeb, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("http_proxy", other.url.replace("http://", "http://user:pass%40word@"))
+    assert bytes(opened(web, "http").get("CURRENT", 99)) == TEXT
+    assert other.requests() == [(f"{web.url}/m/CURRENT", 200)]
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
+    assert bytes(opened(web, "http").get("CURRENT", 99)) == TEXT
+    assert web.requests() == [("m/CURRENT", 200)]
+    monkeypatch.delenv("no_proxy")
+    monkeypatch.setenv("http_proxy", f"socks5://127.0.0.1:1/{SECRET}")
+    with pytest.raises(ConfigError, match="proxy that the environment names") as refused:
+        opened(web, "http")
+    assert SECRET not in str(refused.value)
+
+
+# --- credentials that change while a program runs -----------------------------------------------------
+
+
+def test_credentials_spoilt_while_they_are_used_are_named(
+    web: FaultyWeb, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    file = tmp_path / "credentials"
+    lines = "[default]\naws_access_key_id = key\naws_secret_access_key = secret\n"
+    file.write_text(lines)
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_SESSION_TOKEN"):
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", str(file))
+    store = opened(web, "s3")
+    file.write_text(f"{lines}aws_session_token = {SECRET}\n  second line\n")
+    with pytest.raises(Offline, match="aws_session_token has a line break after") as refused:
+        store.get("CURRENT", 99)
+    assert SECRET not in str(refused.value)
+    file.write_text(lines)
+    assert bytes(store.get("m", 99)) == TEXT
+
+
+def test_a_panic_is_the_failure_of_its_request(web: FaultyWeb) -> None:
+    """Values that nothing has checked make obstore panic, which is no `Exception`."""
+    from obstore.store import S3Store
+
+    store = opened(web, "s3")
+    bad = {"access_key_id": "key\nspoilt", "secret_access_key": "b", "endpoint": web.url, "region": "r"}
+    vars(store)["_store"] = S3Store("maps", config=bad, client_options={"allow_http": True})  # type: ignore[arg-type]
+    found: list[str] = []
+    thread = threading.Thread(target=lambda: found.append(outcome(lambda: store.get("CURRENT", 99))))
+    thread.start()
+    thread.join()
+    assert "the request has made the package obstore fail" in found[0]
+    assert "the request has made the package obstore fail" in outcome(lambda: store.get("CURRENT", 99))
