@@ -158,7 +158,7 @@ def exit_code_of(name: str, run: Callable[[], int]) -> int:
 
 
 def _leave_requests(code: object) -> None:
-    """Exit at once if threads still wait for answers of a store: the interpreter's own end would not be safe."""
+    """Exit at once if threads still wait for answers of a store: the interpreter would wait, or abort."""
     pools = sys.modules.get("shmmap.processes.request_threads")
     if pools is not None and isinstance(code, int) and pools.requests_under_way():
         sys.stdout.flush()

@@ -30,6 +30,6 @@ class RequestThreads(ThreadPoolExecutor):
 def requests_under_way() -> bool:
     """Whether threads with a request have not ended.
 
-    Python would wait at its exit for those of a pool, and be aborted by any that returns from native code then.
+    Python would wait for those of a pool at its exit, and abort if one returns from native code then.
     """
     return any(thread.name.startswith(REQUEST) for thread in threading.enumerate())
