@@ -17,6 +17,9 @@ import numpy as np
 import pytest
 
 from shmmap.layers.build import build_layer
+from shmmap.origin.remote.opened_store import open_store
+from shmmap.progress import NoProgress
+from tests.support.accounts import OTHER_USER
 from tests.support.command_line import Verbs, files_of, locked, make_older
 from tests.support.divided_map import DividedMap, make_map
 from tests.support.map_stores import BucketServer
@@ -521,6 +524,82 @@ def test_a_fetch_that_is_killed_goes_on(
         done = shmmap.json("fetch", store, out)
         assert done["fetched_cells"] <= (0 if label == "fetch.whole" else 3)
     assert files_of(out / "pointcloud_map.pcd") == files_of(town.pcd_dir)
+
+
+class _Interrupts(NoProgress):
+    """Interrupts a fetch when this many cells are there."""
+
+    def __init__(self, cells: int) -> None:
+        self._left = cells
+
+    def advance(self, cells: int) -> None:
+        self._left -= cells
+        if not self._left:
+            raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("damage", ["cut", "bit", "empty", "another's", "link", "two names", "a folder"])
+def test_what_an_interrupted_fetch_left_is_verified(
+    damage: str, town: DividedMap, store: Path, tmp_path: Path
+) -> None:
+    from shmmap.publishing.fetch import fetch_map
+
+    out, aside = tmp_path / "back", tmp_path / "aside"
+    with pytest.raises(KeyboardInterrupt):
+        fetch_map(open_store(str(store)), str(out), progress=_Interrupts(4))
+    cells = tmp_path / ".back.fetching/map/pointcloud_map.pcd"
+    cell = cells / "0_0.pcd"
+    other = next(path for path in cells.iterdir() if path != cell)
+    whole = cell.read_bytes()
+    if damage == "cut":
+        os.truncate(cell, len(whole) - 16)
+    elif damage == "bit":
+        cell.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+    elif damage == "empty":
+        os.truncate(cell, 0)
+    elif damage == "another's":
+        cell.write_bytes(other.read_bytes())
+    elif damage == "two names":
+        os.link(cell, aside)
+    else:
+        cell.rename(aside)
+        cell.symlink_to(aside) if damage == "link" else cell.mkdir()
+    (cells / "0_0.pcd.fetching").write_text("x")
+    (cells / "more").symlink_to(tmp_path)
+    (cells.parent / "pointcloud_map_metadata.yaml").symlink_to(aside)
+    done = fetch_map(open_store(str(store)), str(out), progress=NoProgress())
+    assert (done.fetched_cells, done.cells) == (1, 4)
+    assert files_of(out / "pointcloud_map.pcd") == files_of(town.pcd_dir)
+    assert sorted(os.listdir(out)) == sorted(os.listdir(town.root))
+    assert not aside.exists() or aside.read_bytes() == whole
+
+
+@pytest.mark.parametrize(("owner", "problem"), [(0, "is a symbolic link"), (OTHER_USER, "belongs to user")])
+@pytest.mark.root
+def test_a_planted_fetch_is_refused(
+    owner: int, problem: str, shmmap: Verbs, town: DividedMap, store: Path, tmp_path: Path
+) -> None:
+    """In a directory that all may write: cells and a state of this boot, or a link to another directory."""
+    shared = tmp_path / "shared"
+    shared.mkdir()
+    shared.chmod(0o1777)
+    place, out = shared / ".back.fetching", shared / "back"
+    planted = tmp_path / "victim" if owner == 0 else place
+    shutil.copytree(town.root, planted / "map")
+    boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    root = json.loads((store / "CURRENT").read_bytes())["root"]
+    (planted / "state.json").write_text(json.dumps({"root": root, "boot": boot}))
+    (planted / "lock").write_text("")
+    if owner:
+        os.chown(place, owner, owner)
+    else:
+        place.symlink_to(planted)
+    cells = planted / "map" / "pointcloud_map.pcd"
+    before = files_of(cells)
+    said = shmmap("fetch", store, out, code=73)
+    assert f"{place}: it {problem}" in said
+    assert files_of(cells) == before
+    assert not out.exists()
 
 
 def test_what_is_damaged_or_gone_is_not_fetched(shmmap: Verbs, store: Path, tmp_path: Path) -> None:
