@@ -26,8 +26,9 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from shmmap.failpoints import step
+from shmmap.private_directory import why_not_private
 
-__all__ = ["CELLS", "INDEX", "INTERIM", "LAYERS", "OBJECTS", "DiskBudget", "mark_used", "why_not_private"]
+__all__ = ["CELLS", "INDEX", "INTERIM", "LAYERS", "OBJECTS", "DiskBudget", "mark_used"]
 
 LAYERS: Final = "layers"
 OBJECTS: Final = "objects"
@@ -66,7 +67,7 @@ class DiskBudget:
     limit_bytes
         Maximum total size of the files, bytes.
     owner
-        User id that owns the objects; None: this process's user.
+        User id that owns the files; None: this process's user.
     """
 
     def __init__(self, directory: str, limit_bytes: int, *, owner: int | None = None) -> None:
@@ -148,9 +149,12 @@ class DiskBudget:
     def _places(self) -> list[tuple[str, bool]]:
         """Return the directories with files, and whether each contains index pages."""
         layers, objects = (os.path.join(self.directory, name) for name in (LAYERS, OBJECTS))
-        places = [(layers, False)]
+        owner = os.geteuid() if self._owner is None else self._owner
+        places: list[tuple[str, bool]] = []
         with contextlib.suppress(OSError):
-            owner = os.geteuid() if self._owner is None else self._owner
+            if not why_not_private(os.lstat(layers), owner, or_root=True):
+                places.append((layers, False))
+        with contextlib.suppress(OSError):
             if not why_not_private(os.lstat(objects), owner):
                 places += [(os.path.join(objects, CELLS), False), (os.path.join(objects, INDEX), True)]
         return places
@@ -187,16 +191,3 @@ def mark_used(fd: int, status: os.stat_result) -> None:
     if abs(time.time() - status.st_mtime) > _USED_AGAIN_S:
         with contextlib.suppress(OSError):
             os.utime(fd)
-
-
-def why_not_private(status: os.stat_result, uid: int) -> str:
-    """Return why a directory is not private to a user, as the end of a sentence; empty if it is."""
-    if stat.S_ISLNK(status.st_mode):
-        return "is a symbolic link"
-    if not stat.S_ISDIR(status.st_mode):
-        return "is no directory"
-    if status.st_uid != uid:
-        return f"belongs to user {status.st_uid}, not to user {uid}"
-    if status.st_mode & 0o022:
-        return f"may be written by other users (mode {stat.S_IMODE(status.st_mode):04o})"
-    return ""

@@ -19,31 +19,40 @@ from typing import Final
 __all__ = [
     "CLOSED",
     "DIRECTORY_FLAGS",
+    "PRIVATE",
     "UNWRITABLE",
     "NotPrivate",
     "open_private",
     "opened_private",
     "require_private",
+    "why_not_own",
     "why_not_private",
     "within",
 ]
 
+PRIVATE: Final = 0o700
+"""Mode of a directory for this user alone."""
 UNWRITABLE: Final = 0o022
 """Permissions that others may not have: they may read."""
 CLOSED: Final = 0o077
 """Permissions that others may not have: none at all."""
 
+_OPEN: Final = "may be"
 DIRECTORY_FLAGS: Final = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
 class NotPrivate(PermissionError):
-    """A directory is not this user's, or not closed to others; ``hint`` says what to do."""
+    """A directory is not this user's, or not closed to others.
+
+    ``why`` is the end of a sentence that begins with the path; ``hint`` says what to do.
+    """
 
     def __init__(self, path: str | os.PathLike[str], why: str) -> None:
         super().__init__(errno.EPERM, f"it {why}", os.fspath(path))
+        self.why = why
         self.hint = (
-            "close it (chmod go-w), or remove it"
-            if why.startswith("may be")
+            f"chmod go-w {os.fspath(path)}, or remove it"
+            if why.startswith(_OPEN)
             else "see who made it and remove it, or use another directory"
         )
 
@@ -64,32 +73,37 @@ def why_not_private(
         return "is a symbolic link"
     if not stat.S_ISDIR(status.st_mode):
         return "is no directory"
+    return why_not_own(status, uid, refused=refused, or_root=or_root)
+
+
+def why_not_own(status: os.stat_result, uid: int, *, refused: int = UNWRITABLE, or_root: bool = False) -> str:
+    """Return why a file of any kind is not a user's alone, as `why_not_private`."""
     if status.st_uid != uid and not (or_root and status.st_uid == 0):
         return f"belongs to user {status.st_uid}, not to user {uid}"
     if status.st_mode & refused:
         used = "written" if status.st_mode & UNWRITABLE else "read"
-        return f"may be {used} by other users (mode {stat.S_IMODE(status.st_mode):04o})"
+        return f"{_OPEN} {used} by other users (mode {stat.S_IMODE(status.st_mode):04o})"
     return ""
 
 
 def open_private(
     path: str | os.PathLike[str],
     *,
-    make: bool = False,
+    make: int = 0,
     refused: int = UNWRITABLE,
     or_root: bool = False,
-    dir_fd: int | None = None,
+    own_link: bool = False,
 ) -> int:
     """Open a directory, and return its descriptor; a symbolic link in its place is not followed.
 
     Parameters
     ----------
     make
-        Make it with mode 0700 if it is missing; the directory above must exist.
+        Make it with this mode if it is missing; the directory above must exist.  0: do not.
     refused, or_root
         As in `why_not_private`.
-    dir_fd
-        Descriptor of the directory to which ``path`` is relative.
+    own_link
+        Follow a link that this user or root has made.
 
     Raises
     ------
@@ -101,14 +115,14 @@ def open_private(
     is_new = False
     if make:
         with contextlib.suppress(FileExistsError):
-            os.mkdir(path, 0o700, dir_fd=dir_fd)
+            os.mkdir(path, make)
             is_new = True
     try:
-        fd = os.open(path, DIRECTORY_FLAGS, dir_fd=dir_fd)
+        fd = os.open(_followed(path) if own_link else path, DIRECTORY_FLAGS)
     except OSError as error:
         if error.errno not in (errno.ENOTDIR, errno.ELOOP):
             raise
-        found = os.stat(path, dir_fd=dir_fd, follow_symlinks=False)
+        found = os.lstat(path)
         raise NotPrivate(path, why_not_private(found, found.st_uid) or "was exchanged just now") from None
     try:
         status, uid = os.fstat(fd), os.geteuid()
@@ -126,34 +140,55 @@ def open_private(
 
 @contextlib.contextmanager
 def opened_private(
-    path: str | os.PathLike[str], *, make: bool = False, refused: int = UNWRITABLE, or_root: bool = False
+    path: str | os.PathLike[str],
+    *,
+    make: int = 0,
+    refused: int = UNWRITABLE,
+    or_root: bool = False,
+    own_link: bool = False,
 ) -> Iterator[int]:
     """Open a directory for one operation, as `open_private`: by the next, it may be replaced or gone."""
-    fd = open_private(path, make=make, refused=refused, or_root=or_root)
+    fd = open_private(path, make=make, refused=refused, or_root=or_root, own_link=own_link)
     try:
         yield fd
     finally:
         os.close(fd)
 
 
-def require_private(path: str | os.PathLike[str], *, or_root: bool = False) -> None:
-    """Make a directory if it is missing, and look at it, for what can be reached by name only.
+def require_private(path: str | os.PathLike[str], *, make: int = PRIVATE, refused: int = UNWRITABLE) -> None:
+    """Look at a directory that is used by its name, and make it first if it is missing.
 
-    Others may not be able to exchange it, either: the directory above must be closed to their writing, or be
-    sticky, as /tmp is.
+    All may not be able to exchange it, either: of the directories above, none may be open to all for writing
+    unless it is sticky, as /tmp is.
 
     Raises
     ------
     NotPrivate, OSError
         As `open_private`.
     """
-    above = os.path.dirname(os.path.abspath(path))
-    os.makedirs(above, mode=0o755, exist_ok=True)
-    with opened_private(path, make=True, or_root=or_root):
+    path = os.path.abspath(path)
+    if make:
+        os.makedirs(os.path.dirname(path), mode=0o755, exist_ok=True)
+    with opened_private(path, make=make, refused=refused):
         pass
-    status = os.stat(above)
-    if status.st_mode & UNWRITABLE and not status.st_mode & stat.S_ISVTX:
-        raise NotPrivate(above, f"may be written by other users (mode {stat.S_IMODE(status.st_mode):04o})")
+    while (above := os.path.dirname(path)) != path:
+        status, path = os.stat(above), above
+        if not status.st_mode & stat.S_ISVTX and (
+            why := why_not_own(status, status.st_uid, refused=stat.S_IWOTH)
+        ):
+            raise NotPrivate(above, why)
+
+
+def _followed(path: str | os.PathLike[str]) -> str:
+    """Return where a link of this user or of root leads, else the path itself."""
+    fd = os.open(path, os.O_PATH | os.O_NOFOLLOW | os.O_CLOEXEC)
+    try:
+        status = os.fstat(fd)
+        if not stat.S_ISLNK(status.st_mode) or status.st_uid not in (0, os.geteuid()):
+            return os.fspath(path)
+        return os.path.join(os.path.dirname(path), os.readlink("", dir_fd=fd))
+    finally:
+        os.close(fd)
 
 
 def within(fd: int, name: str = "") -> str:

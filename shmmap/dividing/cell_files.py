@@ -116,7 +116,7 @@ class CellFiles:
         """Note pieces in the journal: (ix, iy, offset, bytes, hash of the bytes) each."""
         with self._journal_lock:
             os.lseek(self._journal, 0, os.SEEK_END)
-            left = memoryview(np.array(pieces, _PIECE).view(np.uint8)).cast("B")
+            left = memoryview(np.array(pieces, _PIECE).tobytes())
             while len(left):
                 left = left[os.write(self._journal, left) :]
 

@@ -27,7 +27,7 @@ from typing import Any, Final
 
 from shmmap.errors import InstanceBusy, ShmmapError
 from shmmap.formats.durable_file import flush_directory, writing_errors
-from shmmap.private_directory import NotPrivate, open_private, within
+from shmmap.private_directory import PRIVATE, NotPrivate, open_private, within
 
 __all__ = ["Workspace"]
 
@@ -80,7 +80,7 @@ class Workspace:
         """Open and lock the directory; a run that ends removes it, then there is a new one."""
         for _ in range(_EXCHANGES):
             with contextlib.suppress(FileNotFoundError), contextlib.ExitStack() as undo:
-                fd = open_private(self._name, make=True)
+                fd = open_private(self._name, make=PRIVATE)
                 undo.callback(os.close, fd)
                 if (names := os.listdir(fd)) and _LOCK not in names:
                     raise NotPrivate(self._name, "is not of an interrupted run")

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from shmmap.disk_budget import DiskBudget, mark_used, why_not_private
+from shmmap.disk_budget import DiskBudget, mark_used
 
 PLACES = {"layer": "layers/version/ab", "cell": "objects/cells/ab", "page": "objects/index/ab"}
 HOUR_S = 3600.0
@@ -176,17 +176,3 @@ def test_use_is_noted_now_and_then_whatever_the_clock_said(here: Directory) -> N
             mark_used(opened.fileno(), os.fstat(opened.fileno()))
         assert (abs(file.stat().st_mtime - used_s) > 1) is noted
         assert not noted or abs(file.stat().st_mtime - now_s) < 60
-
-
-def test_a_directory_of_one_account(tmp_path: Path) -> None:
-    uid, directory = os.geteuid(), tmp_path / "private"
-    directory.mkdir(mode=0o755)
-    assert why_not_private(os.stat(directory), uid) == ""
-    assert why_not_private(os.stat(directory), uid + 1) == f"belongs to user {uid}, not to user {uid + 1}"
-    for mode in (0o775, 0o757, 0o1777):
-        directory.chmod(mode)
-        assert why_not_private(os.stat(directory), uid) == f"may be written by other users (mode {mode:04o})"
-    (tmp_path / "link").symlink_to(directory)
-    assert why_not_private(os.lstat(tmp_path / "link"), uid) == "is a symbolic link"
-    (tmp_path / "file").touch()
-    assert why_not_private(os.lstat(tmp_path / "file"), uid) == "is no directory"

@@ -11,7 +11,16 @@ import pytest
 
 from shmmap.dividing.workspace import Workspace
 from shmmap.errors import CannotWrite, InstanceBusy
-from shmmap.private_directory import CLOSED, NotPrivate, open_private, opened_private, require_private, within
+from shmmap.origin.remote.taken_version import TakenVersion, TakenVersionFile
+from shmmap.private_directory import (
+    CLOSED,
+    PRIVATE,
+    NotPrivate,
+    open_private,
+    opened_private,
+    require_private,
+    within,
+)
 from tests.support.accounts import OTHER_USER
 
 Plant = Callable[[Path, Path], object]
@@ -23,18 +32,18 @@ def of_other_account(path: Path, victim: Path) -> None:
     os.chown(path, OTHER_USER, OTHER_USER)
 
 
-def closed_too_late(path: Path, victim: Path) -> None:
+def closed_too_late(path: Path, victim: Path, mode: int = 0o777) -> None:
     del victim
     path.mkdir()
-    path.chmod(0o777)
+    path.chmod(mode)
 
 
 PLANTED: dict[str, tuple[Plant, str]] = {
     "is a symbolic link": (lambda path, victim: path.symlink_to(victim), "see who made it and remove it"),
     "is no directory": (lambda path, _: path.write_text("x"), "see who made it"),
-    "may be written by other users (mode 0777)": (closed_too_late, "close it (chmod go-w), or remove it"),
+    "may be written by other users (mode 0777)": (closed_too_late, "chmod go-w "),
     "may be written by other users (mode 0775)": (
-        lambda path, _: (path.mkdir(), path.chmod(0o775)),
+        lambda path, victim: closed_too_late(path, victim, 0o775),
         "chmod go-w",
     ),
     f"belongs to user {OTHER_USER}, not to user {os.geteuid()}": (of_other_account, "see who made it"),
@@ -62,7 +71,7 @@ def test_what_others_may_have_planted_is_refused_by_name(
 ) -> None:
     why, hint, plant = planted
     plant(tmp_path / "place", victim)
-    for make in (False, True):
+    for make in (0, PRIVATE):
         with pytest.raises(NotPrivate) as refused:
             open_private(tmp_path / "place", make=make)
         assert (refused.value.filename, refused.value.strerror) == (str(tmp_path / "place"), f"it {why}")
@@ -79,7 +88,7 @@ def test_what_others_may_have_planted_is_refused_by_name(
 def test_a_directory_is_made_for_this_user_alone(tmp_path: Path) -> None:
     before = os.umask(0o002)
     try:
-        with opened_private(tmp_path / "place", make=True) as fd:
+        with opened_private(tmp_path / "place", make=PRIVATE) as fd:
             assert os.fstat(fd).st_mode & 0o777 == 0o700
             (tmp_path / "place").rename(tmp_path / "elsewhere")
             Path(within(fd, "file")).write_text("x")
@@ -99,6 +108,25 @@ def test_a_directory_is_made_for_this_user_alone(tmp_path: Path) -> None:
         require_private(tmp_path / "elsewhere")  # others could exchange it
     tmp_path.chmod(0o1777)
     require_private(tmp_path / "elsewhere")
+
+
+def test_state_of_another_account_is_not_taken(tmp_path: Path) -> None:
+    """The version that a daemon serves until a newer one is taken, and the memory of signed metadata."""
+    file = TakenVersionFile(str(tmp_path), "default", "s3://map")
+    taken = TakenVersion("default", "s3://map", "", 3, b"root", 0.0)
+    file.save(taken)
+    assert file.load() == taken
+    origins = tmp_path / "origins"
+    origins.chmod(0o777)
+    assert file.load() is None
+    assert f"{origins}: it may be written by other users (mode 0777) (chmod go-w {origins}" in file.problem
+    with pytest.raises(CannotWrite, match="may be written"):
+        file.save(taken)
+    origins.chmod(0o700)
+    origins.rename(tmp_path / "aside")
+    origins.symlink_to(tmp_path / "aside")
+    assert file.load() is None
+    assert "is a symbolic link" in file.problem
 
 
 def test_a_directory_that_is_no_workspace_is_not_emptied(tmp_path: Path, victim: Path) -> None:
@@ -126,8 +154,9 @@ def test_a_planted_lock(tmp_path: Path, kind: str) -> None:
 
 
 def test_nothing_is_removed_or_written_through_links(tmp_path: Path, victim: Path) -> None:
-    with pytest.raises(FileNotFoundError), Workspace(str(tmp_path / "map"), keep_failed=True) as space:
-        (space.save({"a": 1}), Path(space.path, "none").read_bytes())
+    with pytest.raises(FileNotFoundError), Workspace(str(tmp_path / "map"), keep_failed=True) as space:  # noqa: PT012
+        space.save({"a": 1})
+        Path(space.path, "none").read_bytes()
     place = tmp_path / ".map.dividing"
     (place / "map").symlink_to(victim)
     (place / "state.json.new").symlink_to(victim / "map" / "mine")
