@@ -38,6 +38,7 @@ INTERIM: Final = ".new-"
 """Prefix of a file's name until the file is complete."""
 
 _KEPT: Final = re.compile(r".+\.layer|[0-9a-f]{64}")
+_BLOCK_BYTES: Final = 4096  # of most file systems
 _SPARE_SHARE: Final = 0.05  # share of the file system that is left free
 _FREED_SHARE: Final = 1 / 16
 _STEPS: Final = 64  # parts of the budget; a process scans again after adding one part
@@ -93,7 +94,7 @@ class DiskBudget:
     def added(self, nbytes: int) -> bool:
         """Count an added file; return True when it is time to `trim`."""
         with self._lock:
-            self._added_bytes += nbytes
+            self._added_bytes += -(-nbytes // _BLOCK_BYTES) * _BLOCK_BYTES
             free_bytes = self.limit_bytes - self._left_bytes
             if self._added_bytes <= max(self.limit_bytes // _STEPS, free_bytes // _PROCESSES):
                 return False
@@ -101,7 +102,7 @@ class DiskBudget:
         return True
 
     def used_bytes(self) -> int:
-        """Return the present total size of the files, bytes."""
+        """Return the bytes that the files take on the disk at present."""
         return sum(kept.nbytes for kept in self._kept(remove_stale=False))
 
     def trim(self) -> int:
@@ -140,7 +141,7 @@ class DiskBudget:
                         key = status.st_dev, status.st_ino
                         kept = found.get(key)
                         if kept is None:
-                            kept = found[key] = _Kept(status.st_mtime, status.st_size, is_index)
+                            kept = found[key] = _Kept(status.st_mtime, _bytes_on_disk(status), is_index)
                         kept.paths.append(entry.path)
                     elif remove_stale and entry.name.startswith(INTERIM) and is_old(status):
                         os.unlink(entry.path)
@@ -158,6 +159,11 @@ class DiskBudget:
             if not why_not_private(os.lstat(objects), owner):
                 places += [(os.path.join(objects, CELLS), False), (os.path.join(objects, INDEX), True)]
         return places
+
+
+def _bytes_on_disk(status: os.stat_result) -> int:
+    """Return what a file takes on the disk; blocks of a file just written may not be counted yet."""
+    return max(status.st_blocks * 512, status.st_size)
 
 
 def _files(place: str) -> Iterator[os.DirEntry[str]]:

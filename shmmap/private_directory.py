@@ -4,7 +4,7 @@
 Their names can be guessed, so another account may have made one before, or a link of that name, wherever it
 may write.  A directory is therefore opened once, its owner and mode are looked at through the descriptor,
 and what is in it is reached through the descriptor, see `within`: exchanging the name afterwards changes
-nothing.  Nobody else can put anything into a directory that was found closed to others.
+nothing.  No other account can put anything into a directory that was found closed to others.
 """
 
 from __future__ import annotations
@@ -120,10 +120,11 @@ def open_private(
     try:
         fd = os.open(_followed(path) if own_link else path, DIRECTORY_FLAGS)
     except OSError as error:
-        if error.errno not in (errno.ENOTDIR, errno.ELOOP):
+        if error.errno not in (errno.ENOTDIR, errno.ELOOP, errno.EACCES):
             raise
-        found = os.lstat(path)
-        raise NotPrivate(path, why_not_private(found, found.st_uid) or "was exchanged just now") from None
+        if why := why_not_private(os.lstat(path), os.geteuid(), refused=refused, or_root=or_root):
+            raise NotPrivate(path, why) from None
+        raise  # or it was exchanged just now
     try:
         status, uid = os.fstat(fd), os.geteuid()
         why = why_not_private(status, uid, refused=refused, or_root=or_root)

@@ -14,7 +14,7 @@ class WorkRoom:
     """Bytes that threads take for pieces of work, and wait for; thread-safe.
 
     A piece that is larger than the room is worked on alone.  Threads get room in the order in which they ask,
-    so a large piece does not wait for ever smaller ones.
+    so smaller ones do not overtake a large piece.
 
     Parameters
     ----------

@@ -30,7 +30,7 @@ from shmmap.errors import BadRequest, MapDataError, MapMissing
 from shmmap.failpoints import step
 from shmmap.formats.durable_file import writing_errors
 from shmmap.formats.pcd.writer import write_pcd
-from shmmap.origin.map_report import REPORT_HEAD, REPORT_NAME, UNKNOWN_FRAME, MapFrame
+from shmmap.origin.map_report import REPORT_HEAD, REPORT_NAME, MapFrame
 from shmmap.origin.metadata import METADATA_NAME, metadata_text
 from shmmap.origin.remote.map_versions import Current, read_entry, read_root, read_shards, require_current
 from shmmap.origin.remote.object_tier import KeptObjects, ObjectTier
@@ -261,8 +261,6 @@ class _Fetch:
 
     def _write_report(self) -> None:
         frame = MapFrame(self._root.origin, self._root.crs, self._root.unit_m)
-        if frame == UNKNOWN_FRAME:
-            return
         report = {**REPORT_HEAD, "origin": frame.origin, "crs": frame.crs, "unit_m": frame.unit_m}
         with open(os.path.join(self._directory, REPORT_NAME), "w", encoding="utf-8") as file:
             json.dump(report, file, indent=2)

@@ -9,6 +9,7 @@ import os
 import re
 import shutil
 import signal
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -17,6 +18,7 @@ import numpy as np
 import pytest
 
 from shmmap.layers.build import build_layer
+from shmmap.origin.map_directory import open_map
 from shmmap.origin.remote.opened_store import open_store
 from shmmap.progress import NoProgress
 from tests.support.accounts import OTHER_USER
@@ -205,7 +207,8 @@ def test_names_of_any_language_in_folders_of_their_own(shmmap: Verbs, tmp_path: 
     lines += [f"{json.dumps(name)}: [{x}, {y}]" for name, (x, y) in town.corners.items()]
     (town.root / "pointcloud_map_metadata.yaml").write_text("\n".join(lines) + "\n")
     done = shmmap.json("publish", town.root, tmp_path / "store")
-    assert (done["cells"], done["notes"]) == (3, [])
+    assert done["cells"] == 3
+    assert ["in 2 cells of 3" in note for note in done["notes"]] == [True]  # two have the third one's points
     read = PublishedMapReader(tmp_path / "store")
     assert set(read.cells) == {"/store/0_0.pcd", "/store/süd/straße 1.pcd", "/store/nord/a/'x': y.pcd"}
     shmmap("fetch", tmp_path / "store", tmp_path / "back")
@@ -447,6 +450,52 @@ def test_pruning_spares_what_is_young_and_what_is_being_published(
     assert "goes with --prune" in shmmap("versions", store, "--keep", "9", code=2)
 
 
+class _Looks(NoProgress):
+    """Lists a directory while cells are published."""
+
+    def __init__(self, directory: Path) -> None:
+        self._directory = directory
+        self.found: list[str] | None = None
+
+    def stage(self, name: str, total: int) -> None:
+        del total
+        if name == "publish":
+            self.found = os.listdir(self._directory)
+
+
+def test_points_outside_of_their_cells_are_noted_and_no_file_can_be_left(
+    shmmap: Verbs, town: DividedMap, store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from shmmap.publishing.messages import PublishSettings
+    from shmmap.publishing.publish import publish_map
+
+    (tmp_path / "tmp").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
+    looks = _Looks(tmp_path / "tmp")
+    again = publish_map(
+        open_map(str(town.root)).load(), open_store(str(store)), [], settings=PublishSettings(str(store)),
+        workers=1, progress=looks,
+    )  # fmt: skip
+    assert (again.version, again.sent_objects, again.notes, looks.found) == (None, 0, [], [])
+    metadata = town.root / "pointcloud_map_metadata.yaml"
+    metadata.write_text(metadata.read_text().replace("0_0.pcd: [0, 0]", "0_0.pcd: [10, 0]"))
+    outside = int((town.points("0_0.pcd")["x"] < 10).sum())
+    assert outside
+    said = shmmap("publish", town.root, store)
+    assert "note: points outside of their cell's box in 1 cell of 4" in said
+    assert f"{outside} in {town.pcd_dir}/0_0.pcd" in said
+
+
+def test_a_cell_in_many_folders_is_no_file(shmmap: Verbs, town: DividedMap, tmp_path: Path) -> None:
+    deep = town.pcd_dir.joinpath(*["d"] * 40)
+    deep.mkdir(parents=True)
+    (town.pcd_dir / "0_0.pcd").rename(deep / "0_0.pcd")
+    shmmap("publish", town.root, tmp_path / "deep")
+    said = shmmap("fetch", tmp_path / "deep", tmp_path / "back", code=2)
+    assert "cannot be a file: its name is too long, or in too many folders" in said
+    assert not (tmp_path / "back").exists()
+
+
 # --- back into files ----------------------------------------------------------------------------------
 
 
@@ -570,7 +619,7 @@ def test_what_an_interrupted_fetch_left_is_verified(
     done = fetch_map(open_store(str(store)), str(out), progress=NoProgress())
     assert (done.fetched_cells, done.cells) == (1, 4)
     assert files_of(out / "pointcloud_map.pcd") == files_of(town.pcd_dir)
-    assert sorted(os.listdir(out)) == sorted(os.listdir(town.root))
+    assert sorted(os.listdir(out)) == sorted([*os.listdir(town.root), "shmmap_divide.json"])
     assert not aside.exists() or aside.read_bytes() == whole
 
 
