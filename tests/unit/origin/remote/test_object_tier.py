@@ -398,7 +398,7 @@ def test_many_threads(origin: Origin, cache: Path) -> None:
         made[hashlib.sha256(data).digest()] = data
     for name, data in made.items():
         (origin.directory / blob_path(name)).write_bytes(data)
-    tier = ObjectTier(str(cache), limit_bytes=40_000)
+    tier = ObjectTier(str(cache), limit_bytes=20 * 4096)
     cells, pages = KeptObjects(origin, tier), KeptObjects(origin, tier, is_index=True)
 
     def read(name: bytes) -> None:
@@ -408,8 +408,8 @@ def test_many_threads(origin: Origin, cache: Path) -> None:
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(read, random_.choices(list(made), k=1500)))
     wait_for_trimming()
-    total = sum(path.stat().st_size for path in cache.rglob("*") if path.is_file())
-    assert 20_000 < total <= 40_000 * 17 / 16
+    total = sum(path.stat().st_blocks * 512 for path in cache.rglob("*") if path.is_file())
+    assert 10 * 4096 < total <= 20 * 4096 * 17 / 16
     counts = [sum(both) for both in zip(cells.counts, pages.counts, strict=True)]
     assert counts[0] + counts[2] == 1500
     assert counts[0] > 300
