@@ -26,8 +26,9 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from shmmap.failpoints import step
+from shmmap.private_directory import why_not_private
 
-__all__ = ["CELLS", "INDEX", "INTERIM", "LAYERS", "OBJECTS", "DiskBudget", "mark_used", "why_not_private"]
+__all__ = ["CELLS", "INDEX", "INTERIM", "LAYERS", "OBJECTS", "DiskBudget", "mark_used"]
 
 LAYERS: Final = "layers"
 OBJECTS: Final = "objects"
@@ -37,6 +38,7 @@ INTERIM: Final = ".new-"
 """Prefix of a file's name until the file is complete."""
 
 _KEPT: Final = re.compile(r".+\.layer|[0-9a-f]{64}")
+_BLOCK_BYTES: Final = 4096  # of most file systems
 _SPARE_SHARE: Final = 0.05  # share of the file system that is left free
 _FREED_SHARE: Final = 1 / 16
 _STEPS: Final = 64  # parts of the budget; a process scans again after adding one part
@@ -66,7 +68,7 @@ class DiskBudget:
     limit_bytes
         Maximum total size of the files, bytes.
     owner
-        User id that owns the objects; None: this process's user.
+        User id that owns the files; None: this process's user.
     """
 
     def __init__(self, directory: str, limit_bytes: int, *, owner: int | None = None) -> None:
@@ -92,7 +94,7 @@ class DiskBudget:
     def added(self, nbytes: int) -> bool:
         """Count an added file; return True when it is time to `trim`."""
         with self._lock:
-            self._added_bytes += nbytes
+            self._added_bytes += -(-nbytes // _BLOCK_BYTES) * _BLOCK_BYTES
             free_bytes = self.limit_bytes - self._left_bytes
             if self._added_bytes <= max(self.limit_bytes // _STEPS, free_bytes // _PROCESSES):
                 return False
@@ -100,7 +102,7 @@ class DiskBudget:
         return True
 
     def used_bytes(self) -> int:
-        """Return the present total size of the files, bytes."""
+        """Return the bytes that the files take on the disk at present."""
         return sum(kept.nbytes for kept in self._kept(remove_stale=False))
 
     def trim(self) -> int:
@@ -139,7 +141,7 @@ class DiskBudget:
                         key = status.st_dev, status.st_ino
                         kept = found.get(key)
                         if kept is None:
-                            kept = found[key] = _Kept(status.st_mtime, status.st_size, is_index)
+                            kept = found[key] = _Kept(status.st_mtime, _bytes_on_disk(status), is_index)
                         kept.paths.append(entry.path)
                     elif remove_stale and entry.name.startswith(INTERIM) and is_old(status):
                         os.unlink(entry.path)
@@ -148,12 +150,20 @@ class DiskBudget:
     def _places(self) -> list[tuple[str, bool]]:
         """Return the directories with files, and whether each contains index pages."""
         layers, objects = (os.path.join(self.directory, name) for name in (LAYERS, OBJECTS))
-        places = [(layers, False)]
+        owner = os.geteuid() if self._owner is None else self._owner
+        places: list[tuple[str, bool]] = []
         with contextlib.suppress(OSError):
-            owner = os.geteuid() if self._owner is None else self._owner
+            if not why_not_private(os.lstat(layers), owner, or_root=True):
+                places.append((layers, False))
+        with contextlib.suppress(OSError):
             if not why_not_private(os.lstat(objects), owner):
                 places += [(os.path.join(objects, CELLS), False), (os.path.join(objects, INDEX), True)]
         return places
+
+
+def _bytes_on_disk(status: os.stat_result) -> int:
+    """Return what a file takes on the disk; blocks of a file just written may not be counted yet."""
+    return max(status.st_blocks * 512, status.st_size)
 
 
 def _files(place: str) -> Iterator[os.DirEntry[str]]:
@@ -187,16 +197,3 @@ def mark_used(fd: int, status: os.stat_result) -> None:
     if abs(time.time() - status.st_mtime) > _USED_AGAIN_S:
         with contextlib.suppress(OSError):
             os.utime(fd)
-
-
-def why_not_private(status: os.stat_result, uid: int) -> str:
-    """Return why a directory is not private to a user, as the end of a sentence; empty if it is."""
-    if stat.S_ISLNK(status.st_mode):
-        return "is a symbolic link"
-    if not stat.S_ISDIR(status.st_mode):
-        return "is no directory"
-    if status.st_uid != uid:
-        return f"belongs to user {status.st_uid}, not to user {uid}"
-    if status.st_mode & 0o022:
-        return f"may be written by other users (mode {stat.S_IMODE(status.st_mode):04o})"
-    return ""

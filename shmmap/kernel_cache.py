@@ -22,11 +22,11 @@ import secrets
 import stat
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
 from shmmap.logfmt import log
+from shmmap.private_directory import PRIVATE, NotPrivate, opened_private, why_not_own
 from shmmap.version import __version__
 
 __all__ = ["all_kept", "compiled_mark", "discard", "kernel_directory", "read_kernel", "write_kernel"]
@@ -43,9 +43,8 @@ def kernel_directory() -> Path | None:
     """Return the directory of compiled kernels, created if missing; None, logged once, if unusable."""
     try:
         path = _place()
-        with contextlib.suppress(FileExistsError):
-            path.mkdir(parents=True, mode=0o700)
-        with _opened(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with _opened(path, make=PRIVATE):
             return path
     except (OSError, RuntimeError) as error:  # RuntimeError: no home directory
         _not_kept(error)
@@ -158,15 +157,9 @@ def _place() -> Path:
     return (Path(base) if base.startswith("/") else Path.home() / ".cache") / "shmmap" / "kernels"
 
 
-@contextlib.contextmanager
-def _opened(directory: Path) -> Iterator[int]:
-    """Open and check a directory, and yield its descriptor, relative to which files are opened."""
-    fd = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        _check_trust(os.fstat(fd), directory)
-        yield fd
-    finally:
-        os.close(fd)
+def _opened(directory: Path, *, make: int = 0) -> contextlib.AbstractContextManager[int]:
+    """Open and check a directory, and give its descriptor, relative to which files are opened."""
+    return opened_private(directory, make=make, or_root=True, own_link=True)
 
 
 def _read(directory: Path, name: str) -> bytes:
@@ -177,20 +170,14 @@ def _read(directory: Path, name: str) -> bytes:
         status = os.fstat(fd)
         if not stat.S_ISREG(status.st_mode):
             raise OSError("not a regular file")
-        _check_trust(status, directory / name)
+        if why := why_not_own(status, os.geteuid(), or_root=True):
+            raise NotPrivate(directory / name, why)
         if status.st_size > _MAX_BYTES:
             raise OSError(f"{status.st_size} bytes, which is too large")
         with open(fd, "rb", closefd=False) as file:
             return file.read()
     finally:
         os.close(fd)
-
-
-def _check_trust(status: os.stat_result, path: Path) -> None:
-    if status.st_uid not in {0, os.geteuid()}:
-        raise PermissionError(f"{path} belongs to another user (uid {status.st_uid}), who is not trusted")
-    if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
-        raise PermissionError(f"{path} can be written by other users: chmod go-w {path}")
 
 
 def _not_kept(error: Exception) -> None:
@@ -203,6 +190,8 @@ def _not_kept(error: Exception) -> None:
 
 
 def _words(why: object) -> str:
+    if isinstance(why, NotPrivate):
+        return f"it {why.why}: {why.hint}"
     if isinstance(why, OSError) and why.strerror:
         return why.strerror
     return str(why) or type(why).__name__

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import subprocess
 import sys
 from typing import Any
@@ -43,11 +44,13 @@ def prepare_on(client: Client, url: str, layers: list[str], slices: int) -> str:
         client.submit(prepare_slice, url, layers, number, slices, retries=2, pure=False)
         for number in range(1, slices + 1)
     ]
+    print(f"{slices} slices are made; each is reported when it is done", flush=True)
     runs = set()
-    for future, made in as_completed(futures, with_results=True):
+    for done, (future, made) in enumerate(as_completed(futures, with_results=True), 1):
         runs.add(made["run"])
-        how = "was there" if made["there"] else f"{made['sent_bytes']:,} bytes sent"
-        print(f"slice {made['slice']} of {slices}: {made['cells']} cells, {how}", flush=True)
+        how = "was there" if made["there"] else f"{made['sent_bytes']:,} bytes sent, {made['seconds']:.0f} s"
+        left = f"{slices - done} left" if done < slices else "all are made"
+        print(f"slice {made['slice']} of {slices}: {made['cells']} cells, {how}; {left}", flush=True)
         future.release()
     (run,) = runs
     return str(run)
@@ -67,7 +70,10 @@ def main() -> int:
     if args.scheduler:
         client = Client(args.scheduler)
     else:
-        client = Client(n_workers=args.workers, threads_per_worker=1, dashboard_address=None)
+        # at the end dask warns of workers that it kills where they do not end within some seconds: no failure
+        client = Client(
+            n_workers=args.workers, threads_per_worker=1, dashboard_address=None, silence_logs=logging.ERROR
+        )
     with client:
         run = prepare_on(client, args.url, args.layer, args.slices)
     join = [sys.executable, "-m", "shmmap.cli", "publish", args.url, "--join", run]

@@ -217,7 +217,7 @@ class DaemonConfig:
     )
     cache_bytes: int = setting(
         8 << 30,
-        "most disk space for computed and prepared layers",
+        "most disk space for computed and prepared layers, and fetched objects of a published map",
         metavar="SIZE",
         allowed=at_least("0"),
         size="cache_size",

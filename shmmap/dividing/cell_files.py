@@ -4,18 +4,24 @@
 A file begins with room for its header, so that each row is written once, at its final place.  Places are
 assigned in the order of the blocks, and filled in any order.  So rows keep their order within a cell although
 blocks are processed in parallel.
+
+A run that may be resumed keeps a journal: place, length and hash (XXH3) of every piece written.  What the
+journal does not confirm is not taken.
 """
 
 from __future__ import annotations
 
 import os
 import resource
-from collections.abc import Callable, Iterable
+import stat
+import threading
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from xxhash import xxh3_64_intdigest
 
 from shmmap.dividing.lattice import CellLattice
 from shmmap.errors import BadRequest
@@ -26,7 +32,10 @@ __all__ = ["CellFiles", "Slot", "pcd_fields", "raise_open_files_limit", "write_a
 
 _ALIGNMENT: Final = 64
 _SPARE_DESCRIPTORS: Final = 128
+_JOURNAL_FLAGS: Final = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
 _MAX_POINTS: Final = (1 << 32) - 1
+
+_PIECE: Final = np.dtype([("ix", "<i8"), ("iy", "<i8"), ("at", "<i8"), ("bytes", "<i8"), ("hash", "<u8")])
 
 Slot = tuple[int, str, int]  # (descriptor or -1, path, offset): place of a cell's next rows
 
@@ -42,6 +51,8 @@ class CellFiles:
         Packed type of a point.
     name
         Function that returns the file name of a cell.
+    journal
+        Path of the journal; empty: none is kept.
 
     Attributes
     ----------
@@ -49,7 +60,14 @@ class CellFiles:
         Rows of each cell, including those being written.
     """
 
-    def __init__(self, directory: str, row: np.dtype[np.void], name: Callable[[int, int], str]) -> None:
+    def __init__(
+        self,
+        directory: str,
+        row: np.dtype[np.void],
+        name: Callable[[int, int], str],
+        *,
+        journal: str = "",
+    ) -> None:
         self.directory = directory
         self.row = row
         self.counts: dict[tuple[int, int], int] = {}
@@ -60,6 +78,8 @@ class CellFiles:
         self._descriptors: dict[tuple[int, int], int] = {}
         soft, _hard = resource.getrlimit(resource.RLIMIT_NOFILE)
         self._max_open = max(16, soft - _SPARE_DESCRIPTORS)
+        self._journal = os.open(journal, _JOURNAL_FLAGS, 0o600) if journal else -1
+        self._journal_lock = threading.Lock()
 
     def path(self, where: tuple[int, int]) -> str:
         """Return the path of a cell's file."""
@@ -92,25 +112,77 @@ class CellFiles:
             write_at((self._descriptors.get(where, -1), self.path(where), 0), header)
         self.close()
 
-    def restore(self, counts: Iterable[tuple[int, int, int]]) -> None:
+    def written(self, pieces: Sequence[tuple[int, int, int, int, int]]) -> None:
+        """Note pieces in the journal: (ix, iy, offset, bytes, hash of the bytes) each."""
+        with self._journal_lock:
+            os.lseek(self._journal, 0, os.SEEK_END)
+            left = memoryview(np.array(pieces, _PIECE).tobytes())
+            while len(left):
+                left = left[os.write(self._journal, left) :]
+
+    @property
+    def has_journal(self) -> bool:
+        """Whether pieces are noted in a journal."""
+        return self._journal >= 0
+
+    def noted_bytes(self) -> int:
+        """Return the length of the journal."""
+        return os.fstat(self._journal).st_size if self.has_journal else 0
+
+    def forget(self) -> None:
+        """Forget all cells and what was noted of them."""
+        self.counts.clear()
+        if self.has_journal:
+            os.ftruncate(self._journal, 0)
+
+    def restore(self, counts: Iterable[tuple[int, int, int]], noted_bytes: int) -> None:
         """Return to an earlier state, (ix, iy, rows) of every cell; later rows are removed.
+
+        Parameters
+        ----------
+        noted_bytes
+            Length of the journal in that state.
 
         Raises
         ------
         OSError
-            A file is missing or shorter than in that state.
+            A file is missing, or its bytes are not those that were written.
         """
         self.counts = {(ix, iy): rows for ix, iy, rows in counts}
         known = {self.name(*where) for where in self.counts}
         for name in os.listdir(self.directory):
             if name not in known:
                 os.unlink(os.path.join(self.directory, name))
-        for where, rows in self.counts.items():
-            path = self.path(where)
-            size = self.header_bytes + rows * self.row.itemsize
-            if os.stat(path).st_size < size:
-                raise OSError(f"{path} is shorter than {size} bytes")
-            os.truncate(path, size)
+        if self.noted_bytes() < noted_bytes or noted_bytes % _PIECE.itemsize:
+            raise OSError("the journal is too short")
+        os.ftruncate(self._journal, noted_bytes)
+        with open(self._journal, "rb", closefd=False) as file:
+            pieces = np.fromfile(file, _PIECE)
+        pieces = pieces[np.lexsort((pieces["at"], pieces["iy"], pieces["ix"]))]
+        cells, starts = np.unique(pieces[["ix", "iy"]], return_index=True)
+        if {(int(ix), int(iy)) for ix, iy in cells} != set(self.counts):
+            raise OSError("the journal is of other cells")
+        for cell, of_cell in zip(cells, np.split(pieces, starts[1:]), strict=True):
+            self._verify((int(cell["ix"]), int(cell["iy"])), of_cell)
+
+    def _verify(self, where: tuple[int, int], pieces: NDArray[Any]) -> None:
+        """Compare a cell's file with its pieces, in order of their places, and cut off what comes after."""
+        path = self.path(where)
+        fd = os.open(path, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+        try:
+            status = os.fstat(fd)
+            if not stat.S_ISREG(status.st_mode) or status.st_nlink != 1:
+                raise OSError(f"{path} is not the file that was written")
+            end = self.header_bytes
+            for _, _, at, nbytes, digest in pieces.tolist():
+                if at != end or xxh3_64_intdigest(os.pread(fd, nbytes, at)) != digest:
+                    raise OSError(f"{path} is not what was written")
+                end += nbytes
+            if end != self.header_bytes + self.counts[where] * self.row.itemsize:
+                raise OSError(f"{path} has other rows than were written")
+            os.ftruncate(fd, end)
+        finally:
+            os.close(fd)
 
     def read(self, where: tuple[int, int]) -> NDArray[np.void]:
         """Return all rows of a cell."""
@@ -124,6 +196,9 @@ class CellFiles:
         """Close every file."""
         while self._descriptors:
             os.close(self._descriptors.popitem()[1])
+        if self.has_journal:
+            os.close(self._journal)
+            self._journal = -1
 
 
 def write_at(slot: Slot, data: Any) -> None:

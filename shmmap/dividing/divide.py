@@ -40,6 +40,7 @@ from shmmap.progress import NoProgress, Progress
 __all__ = ["divide"]
 
 _CELLS: Final = "pointcloud_map.pcd"
+_JOURNAL: Final = "pieces"
 
 
 def divide(
@@ -81,9 +82,9 @@ def divide(
     check_output_directory(out, force=settings.force)
     raise_open_files_limit()
     with contextlib.ExitStack() as stack:
-        space = stack.enter_context(Workspace(out))
         # sources convert OSErrors of reading to MapDataError, so the rest are about writing
         stack.enter_context(writing_errors(out))
+        space = stack.enter_context(Workspace(out))
         return _Run(space, files, settings, lattice, progress, stack).run()
 
 
@@ -139,10 +140,12 @@ class _Run:
                 needed *= 2  # cells as they were read, and in their final encoding
             check_space("the map", needed, space.path, place=f" in {os.path.dirname(space.out)}")
         final = space.directory("map/" + _CELLS)
+        space.clear("map", but=(_CELLS,))
         self._buckets = self._bucket_lattice() if settings.leaf else self._lattice
         stage = self._cell_files(
             space.directory("buckets") if settings.leaf or self._is_encoded else final,
             (lambda x, y: f"{x}_{y}") if settings.leaf else self._name,
+            journal=os.path.join(space.path, _JOURNAL),
         )
         read = self._read_into(stage)
         check_unchanged(self._files)
@@ -168,9 +171,9 @@ class _Run:
 
     # --- parts ----------------------------------------------------------------------------------
 
-    def _cell_files(self, directory: str, name: Callable[[int, int], str]) -> CellFiles:
+    def _cell_files(self, directory: str, name: Callable[[int, int], str], journal: str = "") -> CellFiles:
         """Return cell files that are closed when the run ends in any way."""
-        files = CellFiles(directory, self._row, name)
+        files = CellFiles(directory, self._row, name, journal=journal)
         self._stack.callback(files.close)
         return files
 
@@ -187,6 +190,7 @@ class _Run:
                 partition.drain()
                 state = {
                     "job": job,
+                    "noted_bytes": files.noted_bytes(),
                     "cells": [(ix, iy, rows) for (ix, iy), rows in files.counts.items()],
                     "position": position,
                     "kept": partition.kept,
@@ -208,15 +212,14 @@ class _Run:
         if state is None:
             return 0
         if state.get("job") == job:
-            with contextlib.suppress(OSError):
-                files.restore((ix, iy, rows) for ix, iy, rows in state["cells"])
+            with contextlib.suppress(OSError, LookupError, TypeError, ValueError):
+                files.restore(((ix, iy, rows) for ix, iy, rows in state["cells"]), state["noted_bytes"])
                 partition.kept, partition.dropped = state["kept"], state["dropped"]
                 partition.extremes = np.array(state["extremes"])
                 return int(state["position"])
-        files.counts.clear()
-        self._space.empty()
-        self._space.directory("map/" + _CELLS)
-        os.makedirs(files.directory, exist_ok=True)
+        files.forget()
+        self._space.clear("map/" + _CELLS)
+        self._space.clear(files.directory)
         return 0
 
     def _read(self, partition: Partition, save: Callable[[int], None]) -> None:
@@ -254,14 +257,14 @@ class _Run:
         room = memory_left(settings.memory_bytes)
         if settings.leaf:
             thinned = self._space.directory("thinned") if self._is_encoded else final
-            _empty_directory(thinned)
+            self._space.clear(thinned)
             cells = self._cell_files(thinned, self._name)
             stage.close()
             voxels = CellLattice.of(settings.leaf, settings.origin).moved(*self._frame.origin[:2])
             thin_out(stage, cells, voxels, self._lattice, room, self._progress)
             stage = cells
         if self._is_encoded:
-            _empty_directory(final)
+            self._space.clear(final)
             stage.close()
             return write_encoded(stage, final, settings.encoding, room, self._progress)
         stage.finish()
@@ -333,11 +336,6 @@ class _Run:
             crs=self._units.crs,
             unit_m=self._units.unit_m,
         )
-
-
-def _empty_directory(path: str) -> None:
-    for name in os.listdir(path):
-        os.unlink(os.path.join(path, name))
 
 
 def _check_cells(

@@ -16,6 +16,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from xxhash import xxh3_64_intdigest
 
 from shmmap.dividing.cell_files import CellFiles, Slot, write_at
 from shmmap.dividing.kernels import NOWHERE, assign_cells, count_cells, scatter_rows
@@ -112,15 +113,21 @@ class Partition:
         work = self._work.get()
         try:
             try:
-                slots, numbers = self._sort(work, buffer, count, before, placed)
+                wheres, slots, numbers = self._sort(work, buffer, count, before, placed)
             finally:
                 self._free.put(buffer)
             view = work.rows.view(np.uint8).data
             size = self._files.row.itemsize
             start = 0
-            for slot, number in zip(slots, numbers, strict=True):
-                write_at(slot, view[start * size : (start + number) * size])
+            pieces: list[tuple[int, int, int, int, int]] = []
+            for (ix, iy), slot, number in zip(wheres, slots, numbers, strict=True):
+                rows = view[start * size : (start + number) * size]
+                write_at(slot, rows)
                 start += number
+                if self._files.has_journal:
+                    pieces.append((ix, iy, slot[2], len(rows), xxh3_64_intdigest(rows)))
+            if pieces:
+                self._files.written(pieces)
         except BaseException as error:
             if not placed.done():
                 placed.set_exception(error)  # the next block fails, too
@@ -130,8 +137,8 @@ class Partition:
 
     def _sort(
         self, work: _Buffers, buffer: Rows, count: int, before: Future[None], placed: Future[None]
-    ) -> tuple[list[Slot], list[int]]:
-        """Copy the rows to the work buffer, sorted by cell; return place and number of each cell's rows."""
+    ) -> tuple[list[list[int]], list[Slot], list[int]]:
+        """Copy the rows to the work buffer, sorted by cell; return cells, places and numbers of rows."""
         rows, ix, iy = buffer[:count], work.ix[:count], work.iy[:count]
         extremes = np.array([[np.inf] * 3, [-np.inf] * 3])
         kept, low_x, high_x, low_y, high_y = assign_cells(
@@ -162,9 +169,10 @@ class Partition:
             low_x, low_y, width = 0, 0, len(found)
             places = np.cumsum(numbers) - numbers
         before.result()
+        cells_of_rows: list[list[int]] = wheres.tolist()
         slots = [
             self._files.reserve((ix, iy), number)
-            for (ix, iy), number in zip(wheres.tolist(), numbers.tolist(), strict=True)
+            for (ix, iy), number in zip(cells_of_rows, numbers.tolist(), strict=True)
         ]
         self.kept += kept
         self.dropped += count - kept
@@ -173,7 +181,7 @@ class Partition:
         placed.set_result(None)
         if kept:
             scatter_rows(word_view(rows), ix, iy, low_x, low_y, width, places, word_view(work.rows))
-        return slots, numbers.tolist()
+        return cells_of_rows, slots, numbers.tolist()
 
 
 class _Buffers:

@@ -34,6 +34,7 @@ from shmmap.origin.catalogue_bytes import default_cache_directory
 from shmmap.origin.map_directory import MapDirectory, is_served_whole, open_map
 from shmmap.origin.map_layout import absolute_path
 from shmmap.origin.map_report import LINK_NAME, read_report
+from shmmap.private_directory import PRIVATE, NotPrivate, opened_private, require_private
 from shmmap.processes.start_child import MAX_PACKET_BYTES, how_ended, start_child
 
 __all__ = ["DividedCloud", "find_origin"]
@@ -145,6 +146,7 @@ class DividedCloud:
         out = os.path.join(self._directory, name)
         link = os.path.join(self._directory, LINK_NAME)
         try:
+            require_private(self._directory)
             self._hold()
             with self._alone():
                 if not os.path.isdir(out):  # another daemon may have divided it meanwhile
@@ -152,8 +154,10 @@ class DividedCloud:
                 _point(link, name)
             self._sweep()
         except OSError as error:
+            hint = f"{error.hint}, or " if isinstance(error, NotPrivate) else ""
             raise CannotWrite(
-                f"{error.filename or self._directory}: {error.strerror}", hint="name another --cache-dir"
+                f"{error.filename or self._directory}: {error.strerror}",
+                hint=f"{hint}name another --cache-dir",
             ) from error
         catalogue = MapDirectory(link, strict=self._strict, cache_dir=self._cache_dir).load(
             fresh=fresh, before=before
@@ -199,7 +203,7 @@ class DividedCloud:
     def _hold(self) -> None:
         """Mark the cloud as served by this process until the process ends."""
         if self._use_lock < 0:
-            self._use_lock = locked_entry(self._directory, _USE_LOCK, fcntl.LOCK_SH, mode=0o700)
+            self._use_lock = locked_entry(self._directory, _USE_LOCK, fcntl.LOCK_SH, mode=PRIVATE)
             os.utime(self._use_lock)
 
     def _alone(self) -> contextlib.AbstractContextManager[None]:
@@ -216,8 +220,9 @@ class DividedCloud:
         """Remove the least recently used clouds above the limit, unless a daemon serves them."""
         used: list[tuple[int, str]] = []
         for entry in os.scandir(self._clouds):
-            with contextlib.suppress(OSError):
-                used.append((os.stat(os.path.join(entry.path, _USE_LOCK)).st_mtime_ns, entry.path))
+            with contextlib.suppress(OSError), opened_private(entry.path) as fd:
+                status = os.stat(_USE_LOCK, dir_fd=fd, follow_symlinks=False)
+                used.append((status.st_mtime_ns, entry.path))
         for _, path in sorted(used, reverse=True)[_KEPT_CLOUDS:]:
             with contextlib.suppress(OSError):
                 fd = os.open(os.path.join(path, _USE_LOCK), os.O_RDWR | os.O_CLOEXEC)

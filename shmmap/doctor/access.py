@@ -28,7 +28,7 @@ from shmmap.errors import (
     SocketPermission,
 )
 from shmmap.origin.remote.store import is_url
-from shmmap.protocol.endpoint import fallback_runtime_dir, runtime_dirs, why_not_private
+from shmmap.protocol.endpoint import fallback_runtime_dir, runtime_dirs, why_not_used
 from shmmap.quantities import counted
 from shmmap.segment.pins import has_slot
 
@@ -137,7 +137,7 @@ def _closed_place(diagnosis: Diagnosis) -> str:
         chosen = os.path.dirname(diagnosis.config.socket())
     except ShmmapError:
         return ""
-    why = why_not_private(place) if chosen == place and os.path.lexists(place) else ""
+    why = why_not_used(place) if chosen == place and os.path.lexists(place) else ""
     return f"the daemon would refuse its runtime directory {place}: {why}" if why else ""
 
 

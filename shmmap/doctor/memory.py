@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import stat
@@ -11,11 +12,12 @@ from typing import Final
 
 from shmmap.daemon.host.memory import memory_limit_bytes, room_in_group
 from shmmap.daemon.prerequisites import account_name
-from shmmap.disk_budget import OBJECTS, DiskBudget, why_not_private
+from shmmap.disk_budget import LAYERS, OBJECTS, DiskBudget
 from shmmap.doctor.diagnosis import Diagnosis
 from shmmap.doctor.verdicts import Finding, fail, ok, skip, warn
 from shmmap.mounts import control_groups
 from shmmap.origin.catalogue_bytes import default_cache_directory
+from shmmap.private_directory import why_not_private
 from shmmap.quantities import format_bytes
 from shmmap.service.huge_pages import kernel_version, of_all_sizes
 
@@ -172,8 +174,10 @@ def check_disk_cache(diagnosis: Diagnosis) -> Finding:
     account = account_name(uid)
     if why := _why_not_used(diagnosis, place, status.st_uid):
         return warn(
-            f"{why}: objects of published maps are not kept there: without a connection there is no map",
-            f"chown -R {account} {place} && chmod go-w {place}/{OBJECTS}, or name another cache_dir",
+            f"{why}: objects of published maps, or layers, are not kept there: without a connection there is"
+            " no map",
+            f"chown -R {account} {place} && chmod go-w {place}/{OBJECTS} {place}/{LAYERS}, or name another"
+            " cache_dir",
         )
     budget = DiskBudget(str(directory), diagnosis.config.cache_bytes, owner=uid)
     space = os.statvfs(directory)
@@ -195,9 +199,9 @@ def _why_not_used(diagnosis: Diagnosis, place: str, owner: int) -> str:
     uid = diagnosis.runs_as
     if owner not in (0, uid):
         return f"{place} belongs to {account_name(owner)}, the daemon runs as {account_name(uid)}"
-    objects = f"{place}/{OBJECTS}"
-    try:
-        why = why_not_private(os.lstat(diagnosis.machine.path(objects)), uid)
-    except OSError:
-        return ""  # missing yet, or not accessible
-    return f"{objects} {why}" if why else ""
+    for kept in (OBJECTS, LAYERS):
+        with contextlib.suppress(OSError):  # missing yet, or not accessible
+            found = os.lstat(diagnosis.machine.path(f"{place}/{kept}"))
+            if why := why_not_private(found, uid, or_root=kept == LAYERS):
+                return f"{place}/{kept} {why}"
+    return ""

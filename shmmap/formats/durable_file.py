@@ -124,5 +124,5 @@ def writing_errors(what: str) -> Iterator[None]:
     except OSError as error:
         raise CannotWrite(
             f"cannot write {error.filename or what}: {error.strerror or error}",
-            hint=_HINTS.get(error.errno or 0, ""),
+            hint=getattr(error, "hint", "") or _HINTS.get(error.errno or 0, ""),
         ) from error

@@ -32,6 +32,7 @@ from shmmap.disk_budget import INTERIM, LAYERS, DiskBudget, mark_used
 from shmmap.errors import CannotWrite, SegmentCorrupt
 from shmmap.layers.sources import CellJob
 from shmmap.layers.spec import LayerSpec
+from shmmap.private_directory import opened_private, why_not_own, within
 from shmmap.segment.header import checked_blocks, pack_header, read_page, unpack_header
 from shmmap.segment.layout import LAYOUT_VERSION, SegmentHeader, SourceStamp, header_size
 from shmmap.segment.writer import write_all
@@ -39,6 +40,8 @@ from shmmap.segment.writer import write_all
 __all__ = ["CacheKey", "LayerCache"]
 
 
+_CONTENT: Final = "content"
+_MODE: Final = 0o755  # other accounts may read what root has prepared
 _BLOCK_BYTES: Final = 1 << 18  # a block stays in the L2 cache while it is hashed and written
 
 
@@ -95,11 +98,11 @@ class LayerCache:
         self.budget = DiskBudget(directory, limit_bytes)
         self.writable = True
 
-    def _version_path(self, name: str) -> str:
-        return os.path.join(self.directory, "version", name[:2], f"{name}.layer")
-
-    def _content_path(self, name: str) -> str:
-        return os.path.join(self.directory, "content", name[:2], f"{name}.layer")
+    def _opened(self, *, make: bool = False) -> contextlib.AbstractContextManager[int]:
+        """Open the directory for one operation; it must be this account's or root's, and closed to others."""
+        if make:
+            os.makedirs(os.path.dirname(self.directory), mode=_MODE, exist_ok=True)
+        return opened_private(self.directory, make=_MODE if make else 0, or_root=True)
 
     # --- lookup ---------------------------------------------------------------------------------
 
@@ -116,14 +119,15 @@ class LayerCache:
         return opened[1].total_bytes
 
     def _open(self, key: CacheKey) -> tuple[int, SegmentHeader] | None:
-        path = self._version_path(key.version_name())
+        path = _version_path(key)
         try:
-            fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+            with self._opened() as place:
+                fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK, dir_fd=place)
         except OSError:
             return None
         try:
             status = os.fstat(fd)
-            if status.st_uid in (0, os.geteuid()) and not status.st_mode & 0o022:
+            if not why_not_own(status, os.geteuid(), or_root=True):
                 header = unpack_header(memoryview(read_page(fd, status.st_size)), status.st_size)
                 if _is_of(header, key):
                     mark_used(fd, status)
@@ -173,8 +177,7 @@ class LayerCache:
                 for at, block in checked_blocks(entry, header, _BLOCK_BYTES):
                     write_all(fd, block, at)
             except SegmentCorrupt:
-                self._remove(self._version_path(key.version_name()))
-                self._remove(self._content_path(key.content_name(header.source_digest)))
+                self._remove(_version_path(key), _content_path(key, header.source_digest))
                 os.ftruncate(fd, 0)
                 return None
             write_all(fd, memoryview(pack_header(header)), 0)
@@ -184,15 +187,16 @@ class LayerCache:
 
     def recognise(self, key: CacheKey, digest: bytes) -> bool:
         """Link an entry computed from the same content, if there is one, under this version's name."""
-        with contextlib.suppress(OSError):
-            self._link(self._content_path(key.content_name(digest)), self._version_path(key.version_name()))
+        with contextlib.suppress(OSError), self._opened() as place:
+            _link(_content_path(key, digest), _version_path(key), place)
         return self.has(key)
 
     @property
     def is_empty(self) -> bool:
         """Whether the cache has no entries that `recognise` could find."""
         try:
-            return not os.listdir(os.path.join(self.directory, "content"))
+            with self._opened() as place:
+                return not os.listdir(within(place, _CONTENT))
         except OSError:
             return True
 
@@ -207,8 +211,8 @@ class LayerCache:
             The directory or files in it cannot be created.
         """
         try:
-            os.makedirs(self.directory, mode=0o755, exist_ok=True)
-            tempfile.TemporaryFile(dir=self.directory).close()
+            with self._opened(make=True) as place:
+                tempfile.TemporaryFile(dir=within(place)).close()
         except OSError as error:
             raise CannotWrite(
                 f"layers cannot be kept in {self.directory}: {error.strerror}",
@@ -223,39 +227,59 @@ class LayerCache:
         OSError
             The entry cannot be written.
         """
-        os.makedirs(self.directory, mode=0o755, exist_ok=True)
-        if not self.budget.has_room(header.total_bytes):
-            return False
-        interim_fd, interim = tempfile.mkstemp(prefix=INTERIM, dir=self.directory)
-        try:
+        with self._opened(make=True) as place:
+            if not self.budget.has_room(header.total_bytes):
+                return False
+            interim_fd, interim = tempfile.mkstemp(prefix=INTERIM, dir=within(place))
             try:
-                _copy_all(fd, interim_fd, header.total_bytes)
-                os.fchmod(interim_fd, 0o644)
-            finally:
-                os.close(interim_fd)
-            version = self._version_path(key.version_name())
-            content = self._content_path(key.content_name(header.source_digest))
-            with contextlib.suppress(OSError):  # without hard links, the entry is found only by version
-                self._remove(content)
-                self._link(interim, content)
-            os.makedirs(os.path.dirname(version), mode=0o755, exist_ok=True)
-            os.rename(interim, version)
-        except BaseException:
-            with contextlib.suppress(OSError):
-                os.unlink(interim)
-            raise
+                try:
+                    _copy_all(fd, interim_fd, header.total_bytes)
+                    os.fchmod(interim_fd, 0o644)
+                finally:
+                    os.close(interim_fd)
+                version, content = _version_path(key), _content_path(key, header.source_digest)
+                with contextlib.suppress(OSError):  # without hard links, the entry is found only by version
+                    with contextlib.suppress(FileNotFoundError):
+                        os.unlink(content, dir_fd=place)
+                    _link(interim, content, place)
+                _make_folders(version, place)
+                os.rename(interim, version, dst_dir_fd=place)
+            except BaseException:
+                with contextlib.suppress(OSError):
+                    os.unlink(interim)
+                raise
         if self.budget.added(header.total_bytes):
             self.budget.trim()
         return True
 
-    def _link(self, old: str, new: str) -> None:
-        os.makedirs(os.path.dirname(new), mode=0o755, exist_ok=True)
-        with contextlib.suppress(FileExistsError):
-            os.link(old, new)
+    def _remove(self, *paths: str) -> None:
+        with contextlib.suppress(OSError), self._opened() as place:
+            for path in paths:
+                with contextlib.suppress(OSError):
+                    os.unlink(path, dir_fd=place)
 
-    def _remove(self, path: str) -> None:
-        with contextlib.suppress(OSError):
-            os.unlink(path)
+
+def _version_path(key: CacheKey) -> str:
+    name = key.version_name()
+    return f"version/{name[:2]}/{name}.layer"
+
+
+def _content_path(key: CacheKey, digest: bytes) -> str:
+    name = key.content_name(digest)
+    return f"{_CONTENT}/{name[:2]}/{name}.layer"
+
+
+def _make_folders(path: str, place: int) -> None:
+    folder = os.path.dirname(path)
+    for made in (os.path.dirname(folder), folder):
+        with contextlib.suppress(FileExistsError):
+            os.mkdir(made, _MODE, dir_fd=place)
+
+
+def _link(old: str, new: str, place: int) -> None:
+    _make_folders(new, place)
+    with contextlib.suppress(FileExistsError):
+        os.link(old, new, src_dir_fd=place, dst_dir_fd=place)
 
 
 def _is_of(header: SegmentHeader, key: CacheKey) -> bool:

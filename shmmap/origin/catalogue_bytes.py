@@ -47,6 +47,7 @@ from shmmap.errors import MapDataError
 from shmmap.logfmt import log
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.spatial_index import Grid, GridFrame, MadeOfBoxes
+from shmmap.private_directory import why_not_own
 
 __all__ = [
     "Header",
@@ -342,8 +343,12 @@ def load_sidecar(path: str, key: str, at: Callable[[str], str] = str) -> Catalog
     ``at`` translates a source's path into the path under which this process can open it.
     """
     try:
-        with open(path, "rb") as file:
-            header, catalogue = read_catalogue(file, os.fstat(file.fileno()).st_size)
+        fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+        with open(fd, "rb") as file:
+            status = os.fstat(fd)
+            if why := why_not_own(status, os.geteuid(), or_root=True):
+                raise ValueError(f"it {why}")
+            header, catalogue = read_catalogue(file, status.st_size)
         return catalogue if header.key == key and _unchanged(header.sources, at) else None
     except FileNotFoundError:
         return None

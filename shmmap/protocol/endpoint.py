@@ -4,11 +4,11 @@
 from __future__ import annotations
 
 import os
-import stat
 from collections.abc import Mapping
 from typing import Final
 
 from shmmap.errors import BadRequest
+from shmmap.private_directory import CLOSED, NotPrivate, require_private
 
 __all__ = [
     "DEFAULT_INSTANCE",
@@ -18,7 +18,7 @@ __all__ = [
     "fallback_runtime_dir",
     "runtime_dirs",
     "socket_path",
-    "why_not_private",
+    "why_not_used",
 ]
 
 DEFAULT_INSTANCE: Final = "default"
@@ -37,7 +37,7 @@ def runtime_dirs(environ: Mapping[str, str] = os.environ) -> tuple[str, ...]:
     own = environ.get("XDG_RUNTIME_DIR", "")
     found = [f"{own}/shmmap"] if own.startswith("/") else []
     fallback = fallback_runtime_dir()
-    if os.path.lexists(fallback) and not why_not_private(fallback):
+    if os.path.lexists(fallback) and not why_not_used(fallback):
         found.append(fallback)
     return (*found, SYSTEM_RUNTIME_DIR)
 
@@ -47,19 +47,15 @@ def fallback_runtime_dir() -> str:
     return f"/tmp/shmmap-{os.geteuid()}"  # noqa: S108  its owner is checked
 
 
-def why_not_private(directory: str) -> str:
-    """Return why a directory in /tmp is not private to this user; empty if it is."""
+def why_not_used(directory: str) -> str:
+    """Return why the directory in /tmp is not private to this user, and what to do; empty if it is."""
     try:
-        status = os.lstat(directory)
+        require_private(directory, make=0, refused=CLOSED)
+    except NotPrivate as error:
+        return f"it {error.why} ({error.hint})"
     except OSError as error:
         return str(error.strerror)
-    if stat.S_ISLNK(status.st_mode):
-        return "it is a symbolic link"
-    if not stat.S_ISDIR(status.st_mode):
-        return "it is no directory"
-    if status.st_uid != os.geteuid():
-        return f"it belongs to uid {status.st_uid}"
-    return "others may write or read there (chmod 700)" if status.st_mode & 0o077 else ""
+    return ""
 
 
 def socket_path(runtime_dir: str, instance: str = DEFAULT_INSTANCE) -> str:

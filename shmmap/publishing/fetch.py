@@ -1,39 +1,57 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fetches a published map into files: a divided map in Autoware's format, with every object verified.
 
-The directory appears complete or not at all.  A run after an interrupted one does not fetch its cells again.
+The directory appears complete or not at all.  A run after an interrupted one does not fetch its cells again:
+each finished file's hash (XXH3) is noted, and a file that does not match it is fetched again.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
+import mmap
 import os
+import secrets
+import stat
+import threading
+from collections.abc import Iterable
 from dataclasses import dataclass
+from types import TracebackType
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from xxhash import xxh3_128_hexdigest
 
+from shmmap.dividing.settings import memory_left
 from shmmap.dividing.workspace import Workspace
 from shmmap.errors import BadRequest, MapDataError, MapMissing
 from shmmap.failpoints import step
 from shmmap.formats.durable_file import writing_errors
 from shmmap.formats.pcd.writer import write_pcd
-from shmmap.origin.map_report import REPORT_HEAD, REPORT_NAME, UNKNOWN_FRAME, MapFrame
+from shmmap.origin.map_report import REPORT_HEAD, REPORT_NAME, MapFrame
 from shmmap.origin.metadata import METADATA_NAME, metadata_text
 from shmmap.origin.remote.map_versions import Current, read_entry, read_root, read_shards, require_current
 from shmmap.origin.remote.object_tier import KeptObjects, ObjectTier
 from shmmap.origin.remote.published_index import Root
 from shmmap.origin.remote.published_object import POINTS, ObjectName, read_bare_header, rows_of
 from shmmap.origin.remote.store import Store
-from shmmap.origin.remote.zstd_frame import unpack_frame
+from shmmap.origin.remote.zstd_frame import DAMAGED, unpack_frame
 from shmmap.processes.request_threads import RequestThreads
 from shmmap.progress import Progress
+from shmmap.work_room import WorkRoom
 
 __all__ = ["FetchedMap", "fetch_map"]
 
 _CELLS: Final = "pointcloud_map.pcd"
+_NEW: Final = "new"  # directory of the files in writing: no cell's name can be that of one of them
+_FETCHED: Final = "fetched"
 _CONCURRENT_FETCHES: Final = 16
+_MEMORY_BYTES: Final = 1 << 30
+_COPIES: Final = 3  # an object, its columns, twice as large where they are in millimetres
+_MAX_DIRECTORIES: Final = 32
+_MAX_NAME_BYTES: Final = 255
+_MAX_PATH_BYTES: Final = 3000  # PATH_MAX less what may come before it
 _SAME_M: Final = 1e-6
 
 
@@ -109,13 +127,13 @@ def fetch_map(
     pages = KeptObjects(store, tier, is_index=True, keep=False)
     objects = KeptObjects(store, tier, keep=False)
     root = read_root(pages, current)
-    with Workspace(out, "fetching", keep_failed=True) as workspace, writing_errors(out):
+    with writing_errors(out), Workspace(out, "fetching", keep_failed=True) as workspace:
         begun = {"root": current.root}
         found = workspace.state()
         if found is None or found.get("root") != current.root:
             workspace.empty()
             workspace.save(begun)
-        fetched = _Fetch(pages, objects, root, workspace.directory("map")).run(progress)
+        fetched = _Fetch(pages, objects, root, workspace).run(progress)
         step("fetch.whole")
         workspace.publish(replace=force, durable=True)
         step("fetch.renamed")
@@ -135,23 +153,32 @@ class _Counts:
 class _Fetch:
     """Fetches the cells of a root into a directory."""
 
-    def __init__(self, pages: KeptObjects, objects: KeptObjects, root: Root, directory: str) -> None:
+    def __init__(self, pages: KeptObjects, objects: KeptObjects, root: Root, workspace: Workspace) -> None:
         self._pages = pages
         self._objects = objects
         self._root = root
-        self._directory = directory
-        self._cells_dir = os.path.join(directory, _CELLS)
+        self._workspace = workspace
+        self._directory = workspace.directory("map")
+        self._cells_dir = workspace.directory(f"map/{_CELLS}")
+        self._new = workspace.directory(_NEW)
+        self._room = WorkRoom(memory_left(_MEMORY_BYTES))
 
     def run(self, progress: Progress) -> _Counts:
         counts = _Counts()
         boxes: list[NDArray[np.float64]] = []
-        names: list[str] = []
+        names: dict[str, None] = {}
         progress.stage("fetch", self._root.cells)
-        os.makedirs(self._cells_dir, exist_ok=True)
-        with RequestThreads(_CONCURRENT_FETCHES, "fetch") as pool:
+        with (
+            _Finished(os.path.join(self._workspace.path, _FETCHED)) as self._finished,
+            RequestThreads(_CONCURRENT_FETCHES, "fetch") as pool,
+        ):
+            self._clear()
             for shard in read_shards(self._pages, self._root):
                 boxes.append(shard.boxes)
-                names += (here := [name.decode() for name in shard.names])
+                here = [name.decode() for name in shard.names]
+                for name in here:
+                    self._check_name(name, names)
+                names.update(dict.fromkeys(here))
                 counts.points += int(shard.points.sum(dtype=np.uint64))
                 objects = map(shard.layers[POINTS].name, range(len(shard)))
                 for is_new in pool.map(self._fetch, here, objects):
@@ -162,28 +189,62 @@ class _Fetch:
         self._write_report()
         return counts
 
+    def _clear(self) -> None:
+        """Remove all but files that an interrupted run has finished, links too; their hashes come later."""
+        self._workspace.clear(_NEW)
+        self._workspace.clear("map", but=(_CELLS,))
+        for directory, _, _ in os.walk(self._cells_dir):
+            below = os.path.relpath(directory, self._cells_dir)
+            with os.scandir(directory) as entries:
+                kept = [
+                    entry.name
+                    for entry in entries
+                    if entry.is_dir(follow_symlinks=False)
+                    != (os.path.normpath(os.path.join(below, entry.name)) in self._finished)
+                ]
+            self._workspace.clear(directory, but=kept)
+
+    def _check_name(self, name: str, before: dict[str, None]) -> None:
+        """Refuse a cell whose name cannot be that of a file, or that an earlier shard has."""
+        parts = os.fsencode(name).split(b"/")
+        shown = name if len(name) <= _MAX_NAME_BYTES else f"{name[:64]} ... ({len(name)} characters)"
+        if name in before:
+            raise MapDataError(f"it has two cells {shown}", path=self._objects.url, cause=DAMAGED)
+        if (
+            len(parts) > _MAX_DIRECTORIES
+            or max(map(len, parts)) > _MAX_NAME_BYTES
+            or len(name.encode()) > _MAX_PATH_BYTES
+        ):
+            raise BadRequest(
+                f"the cell {shown} cannot be a file: its name is too long, or in too many folders"
+            )
+
     def _fetch(self, name: str, source: ObjectName) -> bool:
         """Write a cell's file; return False if it exists already."""
         path = os.path.join(self._cells_dir, name)
-        if os.path.exists(path):  # a file gets its name only when it is complete
+        if self._finished.is_whole(name, path):
             return False
-        frame = self._objects.read(source.sha256, source.size)
-        unpacked = unpack_frame(frame, source.raw, name=source.path, exact=True)
-        header = read_bare_header(unpacked, POINTS, name=f"{self._objects.url}/{source.path}")
-        if any(header.origin):
-            raise MapDataError("its coordinates have an origin of their own", path=source.path)
-        columns: dict[str, NDArray[Any]] = {
-            column.name: rows_of(unpacked, column) for column in header.columns
-        }
-        os.makedirs(os.path.dirname(path), exist_ok=True)
-        interim = f"{path}.fetching"
-        with open(interim, "wb") as file:
-            write_pcd(file, columns)
+        with self._room.taken(source.size + _COPIES * source.raw):
+            frame = self._objects.read(source.sha256, source.size)
+            unpacked = unpack_frame(frame, source.raw, name=source.path, exact=True)
+            header = read_bare_header(unpacked, POINTS, name=f"{self._objects.url}/{source.path}")
+            if any(header.origin):
+                raise MapDataError("its coordinates have an origin of their own", path=source.path)
+            columns: dict[str, NDArray[Any]] = {
+                column.name: rows_of(unpacked, column) for column in header.columns
+            }
+            folder = os.path.dirname(name)
+            self._workspace.directory(f"map/{_CELLS}" + (f"/{folder}" if folder else ""))
+            interim = os.path.join(self._new, secrets.token_hex(8))
+            with open(interim, "xb") as file:
+                write_pcd(file, columns)
+        digest = _digest_of(interim)
         step("fetch.cell")
         os.rename(interim, path)
+        self._finished.add(name, digest)
         return True
 
-    def _write_metadata(self, names: list[str], boxes: NDArray[np.float64]) -> None:
+    def _write_metadata(self, names: Iterable[str], boxes: NDArray[np.float64]) -> None:
         size_x, size_y = (_only_size(boxes[:, axis], boxes[:, axis + 2]) for axis in (0, 1))
         entries = [
             (os.path.basename(name), (_number_text(x), _number_text(y)))
@@ -200,11 +261,61 @@ class _Fetch:
 
     def _write_report(self) -> None:
         frame = MapFrame(self._root.origin, self._root.crs, self._root.unit_m)
-        if frame == UNKNOWN_FRAME:
-            return
         report = {**REPORT_HEAD, "origin": frame.origin, "crs": frame.crs, "unit_m": frame.unit_m}
         with open(os.path.join(self._directory, REPORT_NAME), "w", encoding="utf-8") as file:
             json.dump(report, file, indent=2)
+
+
+class _Finished:
+    """The names of finished files with their hashes: a line for each, of which the last may be cut."""
+
+    def __init__(self, path: str) -> None:
+        flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+        self._file = open(os.open(path, flags, 0o600), "r+b", buffering=0)  # noqa: SIM115  closed by __exit__
+        self._lock = threading.Lock()
+        self._digests: dict[str, str] = {}
+        for line in self._file.readall().split(b"\n"):
+            with contextlib.suppress(ValueError):
+                name, digest = json.loads(line)
+                self._digests[str(name)] = str(digest)
+
+    def __enter__(self) -> _Finished:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._file.close()
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._digests
+
+    def is_whole(self, name: str, path: str) -> bool:
+        """Whether a file has the content with which it was finished."""
+        if name not in self:
+            return False
+        try:
+            return _digest_of(path) == self._digests[name]
+        except OSError:
+            return False
+
+    def add(self, name: str, digest: str) -> None:
+        """Note a finished file."""
+        with self._lock:
+            self._file.write(b"\n" + json.dumps([name, digest]).encode() + b"\n")
+
+
+def _digest_of(path: str) -> str:
+    """Return the hash of a regular file that has no other name; OSError for anything else."""
+    fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+    try:
+        status = os.fstat(fd)
+        if not stat.S_ISREG(status.st_mode) or status.st_nlink != 1 or not status.st_size:
+            raise OSError(f"{path} is not a file that was fetched")
+        with mmap.mmap(fd, status.st_size, prot=mmap.PROT_READ) as content:
+            return xxh3_128_hexdigest(content)
+    finally:
+        os.close(fd)
 
 
 def _only_size(low: NDArray[np.float64], high: NDArray[np.float64]) -> float:

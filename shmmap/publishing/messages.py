@@ -98,13 +98,17 @@ class LayerSent(msgspec.Struct, array_like=True):
 
 
 class CellSent(msgspec.Struct, array_like=True, tag="sent"):
-    """Message that the store has all layers of a cell; layers are in the order of the task."""
+    """Message that the store has all layers of a cell; layers are in the order of the task.
+
+    ``outside`` is the number of points outside the cell's box.
+    """
 
     number: int
     points: int
     z_min: float
     z_max: float
     layers: tuple[LayerSent, ...]
+    outside: int = 0
 
 
 class NotSent(msgspec.Struct, array_like=True, tag="not_sent"):

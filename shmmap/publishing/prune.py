@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Removes versions that have not been current for a long time, and objects that no version has.
 
-Entries of old versions are removed first.  Then the entries are listed again, and only old objects that none
+Entries of old versions are removed first, and metadata that signed them.
+Then the entries are listed again, and only old objects that none
 of the remaining versions has are removed.  So versions that are published, restored or read meanwhile keep
 their objects.  Equally old parts of slices were never joined, and are removed as well.
 """
@@ -11,7 +12,7 @@ from __future__ import annotations
 import json
 import time
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from shmmap.errors import BadRequest, MapDataError, MapMissing
 from shmmap.failpoints import step
@@ -78,6 +79,7 @@ def prune_versions(store: Store, *, keep_days: float = KEEP_DAYS, progress: Prog
         step("prune.entry")
         store.delete(entry_path(version))
         result.versions.append(version)
+    _remove_metadata(store, old_s)
     step("prune.listed")
     needed = _needed(store, progress, result)
     result.parts = _remove_parts(store, old_s)
@@ -87,24 +89,53 @@ def prune_versions(store: Store, *, keep_days: float = KEEP_DAYS, progress: Prog
 
 def _require_signed(store: Store, current: Current) -> None:
     """Refuse if a signed map's metadata, which is not verified here, names another version."""
+    if (signed := _signed_now(store)) is None:
+        return
+    if signed.map_version != current.version:
+        raise BadRequest(
+            f"version {signed.map_version} of {store.url} is signed, and CURRENT says {current.version}",
+            hint="correct that: shmmap versions URL --refresh --sign KEYDIR",
+        )
+
+
+class _Signed(NamedTuple):
+    """Numbers of the metadata that a map's timestamp names, and of the version of the map."""
+
+    snapshot: int
+    targets: int
+    map_version: object
+
+
+def _signed_now(store: Store) -> _Signed | None:
+    """Return what is signed; None if the map is not."""
 
     def read(path: str) -> dict[str, Any]:
         signed: dict[str, Any] = json.loads(bytes(store.get(path, MAX_METADATA_BYTES)))["signed"]
         return signed
 
     if store.head(TIMESTAMP) is None:
-        return
+        return None
     try:
-        snapshot = read(f"{read(TIMESTAMP)['meta']['snapshot.json']['version']}.snapshot.json")
-        targets = read(f"{snapshot['meta']['targets.json']['version']}.targets.json")
-        version = targets["targets"]["root"]["custom"]["map_version"]
+        snapshot = int(read(TIMESTAMP)["meta"]["snapshot.json"]["version"])
+        targets = int(read(f"{snapshot}.snapshot.json")["meta"]["targets.json"]["version"])
+        version = read(f"{targets}.targets.json")["targets"]["root"]["custom"]["map_version"]
     except (KeyError, TypeError, ValueError, MapMissing) as error:
         raise MapDataError(f"what is signed cannot be read: {error}", path=store.url) from None
-    if version != current.version:
-        raise BadRequest(
-            f"version {version} of {store.url} is signed, and CURRENT says {current.version}",
-            hint="correct that: shmmap versions URL --refresh --sign KEYDIR",
-        )
+    return _Signed(snapshot, targets, version)
+
+
+def _remove_metadata(store: Store, old_s: float) -> None:
+    """Remove old snapshots and targets before those that the timestamp names; roots stay, a chain."""
+    if (signed := _signed_now(store)) is None:
+        return
+    for kind, number in (("snapshot", signed.snapshot), ("targets", signed.targets)):
+        before: list[str] = []
+        while number > 1 and store.head(f"{number - 1}.{kind}.json") is not None:
+            number -= 1
+            before.append(f"{number}.{kind}.json")
+        for path in reversed(before):  # so that none is left below a gap if this is killed
+            step("prune.metadata")
+            _remove_if_old(store, path, old_s)
 
 
 def _old_versions(store: Store, current: Current, old_s: float) -> list[int]:
@@ -170,7 +201,7 @@ def _remove_objects(
     names = {digest.hex() for digest in needed}
     needed.clear()
     listed = list(store.list(_BLOBS))
-    progress.stage("remove objects", len(listed))
+    progress.stage("look at objects", len(listed))
     for found in listed:
         if found.path.rpartition("/")[2] not in names and found.modified_s < old_s:
             step("prune.object")

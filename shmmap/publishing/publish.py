@@ -8,6 +8,7 @@ objects again that the first one has sent.
 from __future__ import annotations
 
 import itertools
+import os
 import re
 import tempfile
 import time
@@ -50,7 +51,8 @@ from shmmap.publishing.new_version import (
     send_packed,
     switch_version,
 )
-from shmmap.publishing.shards import CellObjects, check_names, divide_into_shards, shard_side
+from shmmap.publishing.shards import CellObjects, check_cells, divide_into_shards, shard_side
+from shmmap.quantities import counted
 
 if TYPE_CHECKING:
     from shmmap.publishing.signing import MapSigner
@@ -76,6 +78,8 @@ class Published:
         Number of objects of the version's layers; number and bytes of all objects that were sent.
     bytes
         Bytes of the objects of all layers.
+    outside
+        Number of points outside of their cell's box, by the ids of such cells.
     """
 
     cells: int
@@ -91,6 +95,17 @@ class Published:
     sent_bytes: int = 0
     bytes: int = 0
     failures: list[Failure] = field(default_factory=list)
+    outside: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def notes(self) -> list[str]:
+        """Remarks on the map, a sentence each."""
+        if not self.outside:
+            return []
+        name = max(self.outside, key=lambda one: self.outside[one])
+        cells = f"{counted(len(self.outside), 'cell')} of {self.cells:,}"
+        missing = "where areas are asked for, these points can be missing"
+        return [f"points outside of their cell's box in {cells}: {self.outside[name]:,} in {name}; {missing}"]
 
 
 class _ShardRow(NamedTuple):
@@ -146,7 +161,7 @@ def publish_map(
         Another publisher was quicker: its version is current.
     """
     refuse_read_only(store)
-    check_names(catalogue)
+    check_cells(catalogue)
     names = (LAYER, *(name for name in canonical_layers([LAYER, *layers]) if name != LAYER))
     return _Run(catalogue, store, names, progress, resend=resend, signer=signer).run(
         settings, id_prefix, max(1, workers)
@@ -200,10 +215,11 @@ class _Run:
         result.id_prefix = self._prefix(id_prefix)
         result.encoding = settings.encoding or (before.encoding if before is not None else EXACT)
         side = shard_side(self._catalogue, len(self._names), before.shard_m if before is not None else None)
-        with tempfile.NamedTemporaryFile(prefix="shmmap-publish-") as known:
+        with tempfile.TemporaryFile(prefix="shmmap-publish-") as known:  # without a name, it cannot be left
+            path = f"/proc/{os.getpid()}/fd/{known.fileno()}"
             settings = msgspec.structs.replace(settings, is_first=not self._look, encoding=result.encoding)
-            if write_known_objects(known.name, self._known_layers()):
-                settings = msgspec.structs.replace(settings, known=known.name)
+            if write_known_objects(path, self._known_layers()):
+                settings = msgspec.structs.replace(settings, known=path)
             objects = self._send_cells(settings, workers)
         if result.failures:
             return result
@@ -287,6 +303,8 @@ class _Run:
         def finished(task: CellTask, done: CellSent | NotSent) -> None:
             if isinstance(done, CellSent):
                 objects.set(task.number, done)
+                if done.outside:
+                    result.outside[task.cell_id] = done.outside
                 for layer in done.layers:
                     self._count(layer.sent)
             else:

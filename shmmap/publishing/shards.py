@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from shmmap.errors import BadRequest, MapDataError
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.remote.published_index import (
+    MAX_METRES,
     MAX_SHARD_BYTES,
     LayerObjects,
     Shard,
@@ -21,7 +22,7 @@ from shmmap.origin.remote.published_index import (
 )
 from shmmap.publishing.messages import CellSent
 
-__all__ = ["CellObjects", "check_names", "divide_into_shards", "shard_side"]
+__all__ = ["CellObjects", "check_cells", "divide_into_shards", "shard_side"]
 
 _CELLS_ALONG_A_SHARD: Final = 32
 _MAX_CELLS: Final = 8192
@@ -62,11 +63,26 @@ class CellObjects:
         return sum(int(objects.sizes.sum(dtype=np.uint64)) for objects in self.layers.values())
 
 
-def check_names(catalogue: Catalogue) -> None:
-    """Raise `BadRequest` if the name of a cell is not valid text."""
+def check_cells(catalogue: Catalogue) -> None:
+    """Refuse cells that no reader would take.
+
+    Raises
+    ------
+    BadRequest
+        The name of a cell is not valid text.
+    MapDataError
+        A cell lies too far out.
+    """
     for name in catalogue.names.tolist():
         if not is_relative_path(name):
             raise BadRequest(f"a cell named {name!r} cannot be published", hint="rename its file")
+    far = np.flatnonzero(~(np.abs(catalogue.boxes) <= MAX_METRES).all(axis=1))
+    if len(far):
+        raise MapDataError(
+            f"cell {catalogue.id(int(far[0]))} is farther out than {MAX_METRES:g} m",
+            cause="too_large",
+            hint="correct the map's metadata",
+        )
 
 
 def shard_side(catalogue: Catalogue, layers: int, before: float | None) -> float:

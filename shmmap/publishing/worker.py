@@ -231,7 +231,8 @@ class Sender:
             )
             header = cell.points
             described = (header.rows, header.z_min, header.z_max) if header is not None else (0, 0.0, 0.0)
-            self._send(CellSent(number, *described, layers))
+            outside = header.outside_points if header is not None else 0
+            self._send(CellSent(number, *described, layers, outside))
         except ShmmapError as error:
             self._send(NotSent(number, "", error.code, error.message, error.hint))
         except Exception as error:  # noqa: BLE001  reported, and then ends the run

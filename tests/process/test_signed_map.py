@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import signal
 import stat
@@ -79,6 +80,13 @@ def test_versions_are_signed_and_what_is_the_same_is_not_signed_again(
     assert {"1.targets.json", "2.targets.json", "1.snapshot.json", "2.snapshot.json"} < names(store)
     done = shmmap.json("versions", store, "--rollback", "1", "--sign", keys)
     assert (done["version"], done["restored"]) == (3, 1)
+    assert read_signed(store, keys).version == 3
+    # what signed versions long ago goes with them, but for the chain of roots
+    there = names(store)
+    for name in there - {"2.targets.json"}:
+        os.utime(store / name, (1e9, 1e9))
+    shmmap("versions", store, "--prune")
+    assert there - names(store) == {"1.targets.json", "1.snapshot.json", "2.snapshot.json"}
     assert read_signed(store, keys).version == 3
 
 

@@ -11,10 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from shmmap.disk_budget import DiskBudget, mark_used, why_not_private
+from shmmap.disk_budget import DiskBudget, mark_used
 
 PLACES = {"layer": "layers/version/ab", "cell": "objects/cells/ab", "page": "objects/index/ab"}
 HOUR_S = 3600.0
+BLOCK = 4096
 
 
 class Directory:
@@ -24,7 +25,7 @@ class Directory:
         self.path = path
         (path / "objects").mkdir(mode=0o700, parents=True)
 
-    def add(self, kind: str, number: int, nbytes: int = 1000, used_s: float | None = None) -> Path:
+    def add(self, kind: str, number: int, nbytes: int = BLOCK, used_s: float | None = None) -> Path:
         folder = self.path / PLACES[kind]
         folder.mkdir(parents=True, exist_ok=True)
         file = folder / (f"{number}.layer" if kind == "layer" else f"{number:064x}")
@@ -49,9 +50,9 @@ def test_layers_and_objects_are_one_order_and_pages_go_last(here: Directory) -> 
     kinds = ["page", *["layer", "cell"] * 5, "page"]
     for number, kind in enumerate(kinds):
         here.add(kind, number)
-    budget = DiskBudget(str(here.path), 12_000)
-    assert budget.trim() == budget.used_bytes() == 12_000, "there is room"
-    assert DiskBudget(str(here.path), 11_000).trim() == 10_000
+    budget = DiskBudget(str(here.path), 12 * BLOCK)
+    assert budget.trim() == budget.used_bytes() == 12 * BLOCK, "there is room"
+    assert DiskBudget(str(here.path), 11 * BLOCK).trim() == 10 * BLOCK
     assert here.left() == {f"{kind} {n}" for n, kind in enumerate(kinds)} - {"layer 1", "cell 2"}
 
 
@@ -60,12 +61,25 @@ def test_pages_go_last_only_up_to_a_quarter_of_the_budget(here: Directory) -> No
         here.add("page", number)
     for number in range(8, 12):
         here.add("cell", number)
-    assert DiskBudget(str(here.path), 8000).trim() == 7000
+    assert DiskBudget(str(here.path), 8 * BLOCK).trim() == 7 * BLOCK
     assert here.left() == {"page 5", "page 6", "page 7"} | {f"cell {n}" for n in range(8, 12)}
-    assert DiskBudget(str(here.path), 4000).trim() == 3000
+    assert DiskBudget(str(here.path), 4 * BLOCK).trim() == 3 * BLOCK
     assert here.left() == {"page 7", "cell 10", "cell 11"}
     assert DiskBudget(str(here.path), 0).trim() == 0
     assert here.left() == set()
+
+
+def test_small_files_count_what_they_take_on_the_disk(here: Directory) -> None:
+    for number in range(8):
+        here.add("cell", number, nbytes=100)
+    on_disk = sum(file.stat().st_blocks * 512 for file in here.path.rglob("*") if file.is_file())
+    assert on_disk > 8 * 100
+    budget = DiskBudget(str(here.path), on_disk)
+    assert budget.used_bytes() == on_disk
+    assert DiskBudget(str(here.path), on_disk // 2).trim() <= on_disk // 2
+    assert 0 < len(here.left()) <= 4
+    of_small = DiskBudget(str(here.path), 256 * BLOCK)
+    assert [of_small.added(1) for _ in range(5)] == [False] * 4 + [True]
 
 
 def test_both_names_of_a_layer_are_one_file(here: Directory) -> None:
@@ -74,8 +88,8 @@ def test_both_names_of_a_layer_are_one_file(here: Directory) -> None:
     other.parent.mkdir(parents=True)
     other.hardlink_to(file)
     here.add("cell", 2)
-    assert DiskBudget(str(here.path), 2000).trim() == 2000
-    assert DiskBudget(str(here.path), 1999).trim() == 1000
+    assert DiskBudget(str(here.path), 2 * BLOCK).trim() == 2 * BLOCK
+    assert DiskBudget(str(here.path), 2 * BLOCK - 1).trim() == BLOCK
     assert not file.exists()
     assert not other.exists()
     assert here.left() == {"cell 2"}
@@ -176,17 +190,3 @@ def test_use_is_noted_now_and_then_whatever_the_clock_said(here: Directory) -> N
             mark_used(opened.fileno(), os.fstat(opened.fileno()))
         assert (abs(file.stat().st_mtime - used_s) > 1) is noted
         assert not noted or abs(file.stat().st_mtime - now_s) < 60
-
-
-def test_a_directory_of_one_account(tmp_path: Path) -> None:
-    uid, directory = os.geteuid(), tmp_path / "private"
-    directory.mkdir(mode=0o755)
-    assert why_not_private(os.stat(directory), uid) == ""
-    assert why_not_private(os.stat(directory), uid + 1) == f"belongs to user {uid}, not to user {uid + 1}"
-    for mode in (0o775, 0o757, 0o1777):
-        directory.chmod(mode)
-        assert why_not_private(os.stat(directory), uid) == f"may be written by other users (mode {mode:04o})"
-    (tmp_path / "link").symlink_to(directory)
-    assert why_not_private(os.lstat(tmp_path / "link"), uid) == "is a symbolic link"
-    (tmp_path / "file").touch()
-    assert why_not_private(os.lstat(tmp_path / "file"), uid) == "is no directory"

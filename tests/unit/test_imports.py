@@ -40,7 +40,9 @@ BASE = {
     "disk_budget",
     "lazy_imports",
     "mounts",
+    "private_directory",
     "progress",
+    "work_room",
     "version",
 }
 PARTS = {
@@ -55,15 +57,17 @@ PARTS = {
     "geometry": {"errors"},
     "formats": {"errors", "columns", "geometry", "logfmt", "processes"},
     "segment": {"errors", "columns", "geometry", "failpoints", "lazy_imports", "mounts"},
-    "protocol": {"errors", "columns", "geometry"},
-    "kernel_cache": {"logfmt", "version"},
+    "protocol": {"errors", "columns", "geometry", "private_directory"},
+    "kernel_cache": {"logfmt", "private_directory", "version"},
     "compile_notices": {"logfmt"},
     "compiling": {"compile_notices", "kernel_cache", "version"},
     "version": set[str](),
     "mounts": set[str](),
     "progress": set[str](),
     "large_tables": set[str](),
-    "disk_budget": {"failpoints"},
+    "disk_budget": {"failpoints", "private_directory"},
+    "private_directory": set[str](),
+    "work_room": set[str](),
     "lazy_imports": {"errors", "segment.process_limits"},
     "live": {"chunks", "client", "lazy_imports", "protocol"},
     "events": {"client", "lazy_imports", "protocol"},
@@ -214,7 +218,7 @@ def test_no_imports_in_a_circle() -> None:
 
 @pytest.mark.parametrize("module", modules(CLIENTS))
 def test_programs_use_public_names_alone(module: str) -> None:
-    """But for kernels, archives, pictures, lazy imports, and command lines, which answer as shmmap's own."""
+    """But for kernels, archives, pictures, private caches, lazy imports, and command lines like shmmap's own."""
     for node in ast.walk(ast.parse(source(module).read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "shmmap":
             if module == "shmmap_clients.command_line" and node.module == "shmmap.cli.programs":
@@ -229,6 +233,7 @@ def test_programs_use_public_names_alone(module: str) -> None:
                 "shmmap.layers",
                 "shmmap.lazy_imports",
                 "shmmap.live",
+                "shmmap.private_directory",
             ):
                 continue
             assert node.module == "shmmap", f"{module} imports {node.module}"

@@ -8,7 +8,6 @@ import fcntl
 import hashlib
 import json
 import os
-import shutil
 import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 from shmmap import BadRequest, Cell, CellError, CellInfo, Client, LoadTimeout, MapListing, ShmmapError
 from shmmap.errors import InstanceBusy, MapMissing
 from shmmap.formats.npz_writer import write_npz
+from shmmap.private_directory import require_private
 from shmmap_clients.elevation_map import surface
 from shmmap_clients.elevation_map.grid import ElevationGrid
 from shmmap_clients.elevation_map.heights import ElevationRule
@@ -309,8 +309,9 @@ def build_elevation_map(
 @contextlib.contextmanager
 def _alone(cache: Path, key: str) -> Iterator[Path]:
     """Lock a directory of the cache, since concurrent runs would overwrite each other's heights."""
-    cache.mkdir(parents=True, exist_ok=True)
-    with open(cache / f"{key}.lock", "wb") as file:
+    require_private(cache / key)
+    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
+    with open(os.open(cache / f"{key}.lock", flags, 0o600), "r+b") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -342,8 +343,8 @@ def _build(
     seams = Seams(boxes)
     state = journal.read(seams)
     if state is None:
-        shutil.rmtree(directory, ignore_errors=True)
-        directory.mkdir(parents=True)
+        for left in directory.iterdir():
+            left.unlink()
         ElevationGrid.create(grid.path, rule.resolution, first, shape)
         state = Checkpoint()
     failed: list[CellError] = []

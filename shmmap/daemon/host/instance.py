@@ -17,7 +17,8 @@ from typing import Final
 from shmmap.daemon.host.signals import StartSignals
 from shmmap.errors import CannotStart, InstanceBusy, ShmmapError
 from shmmap.logfmt import log
-from shmmap.protocol.endpoint import fallback_runtime_dir, why_not_private
+from shmmap.private_directory import CLOSED, NotPrivate, require_private
+from shmmap.protocol.endpoint import fallback_runtime_dir
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.names import name_taken, segment_prefix, statistics_name
 from shmmap.statistics.exclusive_name import has_writer
@@ -50,13 +51,13 @@ def make_runtime_dir(path: Path, gid: int) -> None:
 
 def _make_private(path: Path) -> None:
     """Make the directory in /tmp that replaces ``XDG_RUNTIME_DIR``, for the owner alone."""
-    with contextlib.suppress(FileExistsError):
-        path.mkdir(mode=0o700)
-    if why := why_not_private(str(path)):
+    try:
+        require_private(path, refused=CLOSED)
+    except NotPrivate as error:
         raise CannotStart(
-            f"runtime directory {path}: {why}",
-            hint="see whose it is and remove it, or set XDG_RUNTIME_DIR, or give --runtime-dir",
-        )
+            f"runtime directory {error.filename}: it {error.why}",
+            hint=f"{error.hint}, or set XDG_RUNTIME_DIR, or give --runtime-dir",
+        ) from None
     log.info("runtime directory", path=path, reason="XDG_RUNTIME_DIR is not set")
 
 

@@ -294,13 +294,13 @@ class PublishedOrigin:
         return self._take(taken, root, known)
 
     def _take(self, taken: TakenVersion, root: Root, known: dict[int, Shard]) -> PublishedView:
+        view = PublishedView(root, taken.version, self._fetcher, known, max_bytes=self._catalogue_bytes)
         with self._lock:
             self._taken = taken
         if self._tier is not None:
             digests = [root.shard_sha256(number) for number in range(len(root.keys))]
             self._tier.mark_index_used([bytes.fromhex(taken.current.root), *digests])
         log.info("version of the map", number=taken.version, map_version=f"{root.map_version:016x}")
-        view = PublishedView(root, taken.version, self._fetcher, known, max_bytes=self._catalogue_bytes)
         self._pages.add(view.pages)
         return view
 

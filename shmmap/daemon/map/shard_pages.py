@@ -19,13 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.daemon.map.catalogue_view import PageNews, Pages
-from shmmap.errors import BadRequest, Offline, ShmmapError
+from shmmap.errors import BadRequest, MapDataError, Offline, ShmmapError
 from shmmap.geometry import Area, distance_to_boxes
 from shmmap.large_tables import ShardedDict
 from shmmap.logfmt import log
 from shmmap.origin.remote.map_versions import read_shard_object
 from shmmap.origin.remote.published_index import Root, Shard, unpack_shard
 from shmmap.origin.remote.store import ObjectReader
+from shmmap.origin.remote.zstd_frame import DAMAGED
 
 __all__ = ["FEW_SHARDS", "THREADS", "Page", "ShardFetcher", "ShardPages"]
 
@@ -194,6 +195,11 @@ class ShardPages:
         Shards that are in memory from the beginning, by number.
     max_bytes
         Memory limit of pages; if the map has few shards, all are kept.
+
+    Raises
+    ------
+    MapDataError
+        Two of the known shards have one cell (cause ``damaged``).
     """
 
     def __init__(
@@ -222,7 +228,10 @@ class ShardPages:
         self._news.notify()  # the first `collect` requests pages that nothing needs
         for number, shard in known.items():
             page = self._page(number, shard)
-            self._take(page, _shared_out(page))
+            names = _shared_out(page)
+            if (twice := self._known_name(names)) is not None:
+                raise MapDataError(f"two cells are called {root.id_prefix}{twice}", cause=DAMAGED)
+            self._take(page, names)
 
     @property
     def fd(self) -> int:
@@ -361,6 +370,13 @@ class ShardPages:
             self._wanted.pop(number, None)
             if number in self._here:
                 continue
+            if page is not None and (twice := self._known_name(names)) is not None:
+                log.error(
+                    "part of the list of cells cannot be used",
+                    part=f"shard {self.root.keys[number].tolist()}",
+                    reason=f"its cell {self.root.id_prefix}{twice} is in another shard, too",
+                )
+                page = None
             if page is None:
                 self._lost.add(number)
                 lost.append(number)
@@ -414,6 +430,13 @@ class ShardPages:
 
     def _page(self, number: int, shard: Shard) -> Page:
         return Page.of(number, shard, self._first[number])
+
+    def _known_name(self, names: list[dict[bytes, int]]) -> str | None:
+        """Return one of these names that a page in memory has."""
+        for table, some in zip(self._by_name, names, strict=True):
+            if not table.keys().isdisjoint(some):
+                return next(iter(table.keys() & some.keys())).decode()
+        return None
 
     def _take(self, page: Page, names: list[dict[bytes, int]]) -> None:
         self._here[page.number] = page

@@ -24,13 +24,14 @@ from collections.abc import Iterable, Iterator
 from hashlib import sha256
 from typing import Final, NamedTuple
 
-from shmmap.disk_budget import CELLS, INDEX, INTERIM, OBJECTS, DiskBudget, mark_used, why_not_private
+from shmmap.disk_budget import CELLS, INDEX, INTERIM, OBJECTS, DiskBudget, mark_used
 from shmmap.errors import MapDataError, ShmmapError
 from shmmap.failpoints import step
 from shmmap.logfmt import log
 from shmmap.origin.remote.published_object import blob_path
 from shmmap.origin.remote.store import ObjectReader
 from shmmap.origin.remote.zstd_frame import DAMAGED
+from shmmap.private_directory import DIRECTORY_FLAGS, PRIVATE, NotPrivate, opened_private
 from shmmap.segment.writer import write_all
 
 __all__ = ["KeptObjects", "ObjectCounts", "ObjectTier", "kept_objects"]
@@ -38,7 +39,6 @@ __all__ = ["KeptObjects", "ObjectCounts", "ObjectTier", "kept_objects"]
 _BLOB: Final = re.compile("blobs/sha256/([0-9a-f]{64})")
 _ABSENT: Final = (errno.ENOENT, errno.ESTALE)
 _NEVER_RIGHT: Final = (errno.ELOOP, errno.ENXIO, errno.EIO)  # symbolic link, socket, bad block
-_FOLDER_FLAGS: Final = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
 class ObjectTier:
@@ -130,10 +130,7 @@ class ObjectTier:
             os.makedirs(self._cache_dir, mode=0o755, exist_ok=True)
             if not self._budget.has_room(nbytes):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            self._require_our_cache()
-            with contextlib.suppress(FileExistsError):
-                os.mkdir(self.directory, 0o700)
-            with self._opened() as place:
+            with self._opened(make=PRIVATE) as place:
                 _write(place, _path(digest, is_index), memoryview(data), durable=is_index)
         except OSError as error:
             self._say(error)
@@ -170,33 +167,25 @@ class ObjectTier:
                     os.utime(_path(digest, True), dir_fd=place, follow_symlinks=False)
 
     @contextlib.contextmanager
-    def _opened(self) -> Iterator[int]:
-        """Open the directory for one operation: by the next, it may be replaced or gone.
+    def _opened(self, *, make: int = 0) -> Iterator[int]:
+        """Open the directory for one operation.
 
         Raises
         ------
         OSError
-            The directory does not exist, or other accounts can write to it (`_NotPrivate`).
+            The directory does not exist, or is not private to this account (`NotPrivate`).
         """
-        self._require_our_cache()
-        if why := why_not_private(os.lstat(self.directory), os.geteuid()):
-            raise _NotPrivate(f"{self.directory} {why}")
-        place = os.open(self.directory, _FOLDER_FLAGS)
-        try:
-            if why := why_not_private(os.fstat(place), os.geteuid()):
-                raise _NotPrivate(f"{self.directory} {why}")
-            yield place
-        finally:
-            os.close(place)
-
-    def _require_our_cache(self) -> None:
-        """Refuse another user's cache: the owner's service could not use files that root created in it."""
+        # in another user's cache, the owner's service could not use files that root created
         uid, owner = os.geteuid(), os.stat(self._cache_dir).st_uid
         if owner not in (0, uid):
-            raise _NotPrivate(f"{self._cache_dir} belongs to user {owner}, not to user {uid}")
+            raise NotPrivate(self._cache_dir, f"belongs to user {owner}, not to user {uid}")
+        with opened_private(self.directory, make=make) as place:
+            yield place
 
     def _reason(self, error: OSError) -> str:
-        return str(error) if isinstance(error, _NotPrivate) else f"{self.directory}: {error.strerror}"
+        if isinstance(error, NotPrivate):
+            return f"{error.filename} {error.why}"
+        return f"{self.directory}: {error.strerror}"
 
     def _say(self, error: OSError) -> None:
         if self._quiet or error.errno in _ABSENT:
@@ -207,10 +196,6 @@ class ObjectTier:
                 return
             self._said.add(reason)
         log.warning("objects not kept on disk", reason=reason)
-
-
-class _NotPrivate(OSError):
-    """Error for a directory that is not private to this account."""
 
 
 def _path(digest: bytes, is_index: bool) -> str:
@@ -239,7 +224,7 @@ def _write(place: int, path: str, data: memoryview, *, durable: bool) -> None:
     for made in (os.path.dirname(folder), folder):
         with contextlib.suppress(FileExistsError):
             os.mkdir(made, 0o700, dir_fd=place)
-    within = os.open(folder, _FOLDER_FLAGS, dir_fd=place)
+    within = os.open(folder, DIRECTORY_FLAGS, dir_fd=place)
     try:
         interim = INTERIM + secrets.token_hex(8)
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC

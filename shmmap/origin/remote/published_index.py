@@ -72,6 +72,9 @@ ENCODINGS: Final = (EXACT, MILLIMETRES)
 MAX_LAYERS: Final = 64
 _MAX_SPEC_CHARACTERS: Final = 200
 _MAX_TEXT_CHARACTERS: Final = 4096
+MAX_METRES: Final = 1e12
+"""Coordinates and lengths are at most this far: sums and products of them are finite, and differences too."""
+_UNITS_M: Final = (1e-9, 1e9)
 _ROUNDING: Final = 2.0**-22  # twice the relative distance by which rounding to float32 may move a border
 _SMALLEST_OBJECT_BYTES: Final = 4096
 
@@ -353,6 +356,12 @@ def unpack_root(frame: bytes | memoryview, *, name: str = "root") -> Root:
         raise wrong("a number is not finite, or the bounds are no rectangle")
     if found.shard_m <= 0 or min(*found.unit_m) <= 0 or min(*found.largest_m, *found.mean_m) < 0:
         raise wrong("a length is not positive")
+    lengths = (*found.origin, *found.bounds, found.shard_m, *found.largest_m, *found.mean_m)
+    if (
+        max(map(abs, lengths)) > MAX_METRES
+        or not _UNITS_M[0] <= min(found.unit_m) <= max(found.unit_m) <= _UNITS_M[1]
+    ):
+        raise wrong(f"a coordinate, a length or a unit is out of range ({MAX_METRES:g} m)")
     if POINTS not in found.layers:
         raise wrong("its layers have no points")
     check_layers(found.layers, wrong)
@@ -534,15 +543,18 @@ def unpack_shard(frame: bytes | memoryview, root: Root, number: int) -> Shard:
         },
     )
     low, high = shard.boxes[:, :2], shard.boxes[:, 2:]
-    if not np.isfinite(shard.boxes).all() or (low > high).any():
-        raise wrong("a box is no rectangle")
+    if not (np.abs(shard.boxes) <= MAX_METRES).all() or (low > high).any():
+        raise wrong("a box is no rectangle, or out of range")
     if (high - low > np.array(root.largest_m)).any():
         raise wrong("a cell is larger than the root's largest")
     if (shard_keys(shard.boxes, root.shard_m) != root.keys[number]).any():
         raise wrong("a cell lies in another shard")
     has_points = shard.points > 0
-    if not np.isfinite(shard.z[has_points]).all() or (shard.z[has_points, 0] > shard.z[has_points, 1]).any():
-        raise wrong("a cell's lowest point is above its highest")
+    if (
+        not (np.abs(shard.z[has_points]) <= MAX_METRES).all()
+        or (shard.z[has_points, 0] > shard.z[has_points, 1]).any()
+    ):
+        raise wrong("a cell's lowest point is above its highest, or out of range")
     for layer in shard.layers.values():
         raws = layer.raws.astype(np.int64)
         if (raws < _SMALLEST_OBJECT_BYTES).any() or (raws > MAX_OBJECT_BYTES).any():

@@ -28,6 +28,7 @@ from shmmap.failpoints import step
 from shmmap.formats.durable_file import appearing_file, flush_directory, writing_errors
 from shmmap.origin.remote.map_versions import Current
 from shmmap.origin.remote.published_index import MAX_ROOT_BYTES
+from shmmap.private_directory import NotPrivate, require_private
 
 __all__ = ["Judgement", "TakenVersion", "TakenVersionFile", "judge_offer"]
 
@@ -104,11 +105,15 @@ class TakenVersionFile:
         """
         self.problem = ""
         try:
+            require_private(os.path.dirname(self.path), make=0)
             self._remove_interim()
-            fd = os.open(self.path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+            fd = os.open(self.path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
             with open(fd, "rb") as file:
                 data = file.read(_MAX_BYTES + 1)
         except FileNotFoundError:
+            return None
+        except NotPrivate as error:
+            self.problem = f"{error.filename}: {error.strerror} ({error.hint})"
             return None
         except OSError as error:
             self.problem = f"{self.path}: {error.strerror}"
@@ -131,8 +136,7 @@ class TakenVersionFile:
         """
         body = _HEAD.pack(_MAGIC, _FORMAT) + msgspec.msgpack.encode(taken)
         with writing_errors(self.path):
-            directory = os.path.dirname(self.path)
-            os.makedirs(directory, mode=0o700, exist_ok=True)
+            require_private(os.path.dirname(self.path))
             with appearing_file(self.path) as file:
                 file.write(body)
                 step("taken.head")

@@ -33,6 +33,7 @@ from shmmap.origin.remote.verify_apart import (
     no_root_of_trust,
     read_trusted_root,
 )
+from shmmap.private_directory import require_private
 from shmmap.processes.end_with_parent import die_with
 from shmmap.quantities import format_utc
 
@@ -66,7 +67,7 @@ def verify_version(store: Store, trusted: bytes, state_dir: str, trust: str = ""
 
     memory = memory_directory(state_dir, store.url, trusted)
     with writing_errors(memory):
-        os.makedirs(memory, mode=0o700, exist_ok=True)
+        require_private(memory)
         with locked_file(os.path.join(memory, ".lock")):
             _remove_interim(memory)
             updater, asked = _updater(store, trusted, memory, trust)

@@ -57,6 +57,30 @@ def test_the_cache_keeps_what_is_used(tmp_path: Path, monkeypatch: pytest.Monkey
     assert len(served.load(fresh=True)) > 4
 
 
+def test_a_planted_division_is_not_served(tmp_path: Path) -> None:
+    """Its name can be computed by all who may write to the cache; a daemon says why it does not start."""
+    origin = DividedCloud(str(cloud(tmp_path / "0.pcd")), str(tmp_path / "cache"))
+    origin.load()
+    (divided,) = (tmp_path / "cache" / "divided").iterdir()
+    for plant, why in (
+        (lambda: divided.chmod(0o775), r"may be written by other users \(mode 0775\).*chmod go-w"),
+        (lambda: (tmp_path / "cache").chmod(0o777), r"cache: it may be written by other users \(mode 0777\)"),
+        (lambda: divided.rename(tmp_path / "aside"), ""),
+        (lambda: divided.symlink_to(tmp_path / "aside"), "is a symbolic link"),
+    ):
+        plant()
+        if why:
+            with pytest.raises(CannotWrite, match=why):
+                origin.load(fresh=True)
+        for path in (divided, tmp_path / "cache"):
+            if path.exists() and not path.is_symlink():
+                path.chmod(0o700)
+    divided.unlink()
+    (tmp_path / "aside").rename(divided)
+    (divided.parent / "link").symlink_to(tmp_path)
+    assert len(origin.load(fresh=True)) > 4
+
+
 def test_a_change_is_seen_and_nothing_old_stays(tmp_path: Path) -> None:
     path = cloud(tmp_path / "a.pcd")
     origin = DividedCloud(str(path), str(tmp_path / "cache"))

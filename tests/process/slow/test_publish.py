@@ -9,6 +9,7 @@ import os
 import re
 import shutil
 import signal
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -17,6 +18,10 @@ import numpy as np
 import pytest
 
 from shmmap.layers.build import build_layer
+from shmmap.origin.map_directory import open_map
+from shmmap.origin.remote.opened_store import open_store
+from shmmap.progress import NoProgress
+from tests.support.accounts import OTHER_USER
 from tests.support.command_line import Verbs, files_of, locked, make_older
 from tests.support.divided_map import DividedMap, make_map
 from tests.support.map_stores import BucketServer
@@ -202,7 +207,8 @@ def test_names_of_any_language_in_folders_of_their_own(shmmap: Verbs, tmp_path: 
     lines += [f"{json.dumps(name)}: [{x}, {y}]" for name, (x, y) in town.corners.items()]
     (town.root / "pointcloud_map_metadata.yaml").write_text("\n".join(lines) + "\n")
     done = shmmap.json("publish", town.root, tmp_path / "store")
-    assert (done["cells"], done["notes"]) == (3, [])
+    assert done["cells"] == 3
+    assert ["in 2 cells of 3" in note for note in done["notes"]] == [True]  # two have the third one's points
     read = PublishedMapReader(tmp_path / "store")
     assert set(read.cells) == {"/store/0_0.pcd", "/store/süd/straße 1.pcd", "/store/nord/a/'x': y.pcd"}
     shmmap("fetch", tmp_path / "store", tmp_path / "back")
@@ -444,6 +450,52 @@ def test_pruning_spares_what_is_young_and_what_is_being_published(
     assert "goes with --prune" in shmmap("versions", store, "--keep", "9", code=2)
 
 
+class _Looks(NoProgress):
+    """Lists a directory while cells are published."""
+
+    def __init__(self, directory: Path) -> None:
+        self._directory = directory
+        self.found: list[str] | None = None
+
+    def stage(self, name: str, total: int) -> None:
+        del total
+        if name == "publish":
+            self.found = os.listdir(self._directory)
+
+
+def test_points_outside_of_their_cells_are_noted_and_no_file_can_be_left(
+    shmmap: Verbs, town: DividedMap, store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from shmmap.publishing.messages import PublishSettings
+    from shmmap.publishing.publish import publish_map
+
+    (tmp_path / "tmp").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
+    looks = _Looks(tmp_path / "tmp")
+    again = publish_map(
+        open_map(str(town.root)).load(), open_store(str(store)), [], settings=PublishSettings(str(store)),
+        workers=1, progress=looks,
+    )  # fmt: skip
+    assert (again.version, again.sent_objects, again.notes, looks.found) == (None, 0, [], [])
+    metadata = town.root / "pointcloud_map_metadata.yaml"
+    metadata.write_text(metadata.read_text().replace("0_0.pcd: [0, 0]", "0_0.pcd: [10, 0]"))
+    outside = int((town.points("0_0.pcd")["x"] < 10).sum())
+    assert outside
+    said = shmmap("publish", town.root, store)
+    assert "note: points outside of their cell's box in 1 cell of 4" in said
+    assert f"{outside} in {town.pcd_dir}/0_0.pcd" in said
+
+
+def test_a_cell_in_many_folders_is_no_file(shmmap: Verbs, town: DividedMap, tmp_path: Path) -> None:
+    deep = town.pcd_dir.joinpath(*["d"] * 40)
+    deep.mkdir(parents=True)
+    (town.pcd_dir / "0_0.pcd").rename(deep / "0_0.pcd")
+    shmmap("publish", town.root, tmp_path / "deep")
+    said = shmmap("fetch", tmp_path / "deep", tmp_path / "back", code=2)
+    assert "cannot be a file: its name is too long, or in too many folders" in said
+    assert not (tmp_path / "back").exists()
+
+
 # --- back into files ----------------------------------------------------------------------------------
 
 
@@ -521,6 +573,82 @@ def test_a_fetch_that_is_killed_goes_on(
         done = shmmap.json("fetch", store, out)
         assert done["fetched_cells"] <= (0 if label == "fetch.whole" else 3)
     assert files_of(out / "pointcloud_map.pcd") == files_of(town.pcd_dir)
+
+
+class _Interrupts(NoProgress):
+    """Interrupts a fetch when this many cells are there."""
+
+    def __init__(self, cells: int) -> None:
+        self._left = cells
+
+    def advance(self, cells: int) -> None:
+        self._left -= cells
+        if not self._left:
+            raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("damage", ["cut", "bit", "empty", "another's", "link", "two names", "a folder"])
+def test_what_an_interrupted_fetch_left_is_verified(
+    damage: str, town: DividedMap, store: Path, tmp_path: Path
+) -> None:
+    from shmmap.publishing.fetch import fetch_map
+
+    out, aside = tmp_path / "back", tmp_path / "aside"
+    with pytest.raises(KeyboardInterrupt):
+        fetch_map(open_store(str(store)), str(out), progress=_Interrupts(4))
+    cells = tmp_path / ".back.fetching/map/pointcloud_map.pcd"
+    cell = cells / "0_0.pcd"
+    other = next(path for path in cells.iterdir() if path != cell)
+    whole = cell.read_bytes()
+    if damage == "cut":
+        os.truncate(cell, len(whole) - 16)
+    elif damage == "bit":
+        cell.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+    elif damage == "empty":
+        os.truncate(cell, 0)
+    elif damage == "another's":
+        cell.write_bytes(other.read_bytes())
+    elif damage == "two names":
+        os.link(cell, aside)
+    else:
+        cell.rename(aside)
+        cell.symlink_to(aside) if damage == "link" else cell.mkdir()
+    (cells / "0_0.pcd.fetching").write_text("x")
+    (cells / "more").symlink_to(tmp_path)
+    (cells.parent / "pointcloud_map_metadata.yaml").symlink_to(aside)
+    done = fetch_map(open_store(str(store)), str(out), progress=NoProgress())
+    assert (done.fetched_cells, done.cells) == (1, 4)
+    assert files_of(out / "pointcloud_map.pcd") == files_of(town.pcd_dir)
+    assert sorted(os.listdir(out)) == sorted([*os.listdir(town.root), "shmmap_divide.json"])
+    assert not aside.exists() or aside.read_bytes() == whole
+
+
+@pytest.mark.parametrize(("owner", "problem"), [(0, "is a symbolic link"), (OTHER_USER, "belongs to user")])
+@pytest.mark.root
+def test_a_planted_fetch_is_refused(
+    owner: int, problem: str, shmmap: Verbs, town: DividedMap, store: Path, tmp_path: Path
+) -> None:
+    """In a directory that all may write: cells and a state of this boot, or a link to another directory."""
+    shared = tmp_path / "shared"
+    shared.mkdir()
+    shared.chmod(0o1777)
+    place, out = shared / ".back.fetching", shared / "back"
+    planted = tmp_path / "victim" if owner == 0 else place
+    shutil.copytree(town.root, planted / "map")
+    boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    root = json.loads((store / "CURRENT").read_bytes())["root"]
+    (planted / "state.json").write_text(json.dumps({"root": root, "boot": boot}))
+    (planted / "lock").write_text("")
+    if owner:
+        os.chown(place, owner, owner)
+    else:
+        place.symlink_to(planted)
+    cells = planted / "map" / "pointcloud_map.pcd"
+    before = files_of(cells)
+    said = shmmap("fetch", store, out, code=73)
+    assert f"{place}: it {problem}" in said
+    assert files_of(cells) == before
+    assert not out.exists()
 
 
 def test_what_is_damaged_or_gone_is_not_fetched(shmmap: Verbs, store: Path, tmp_path: Path) -> None:

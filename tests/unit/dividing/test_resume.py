@@ -140,7 +140,7 @@ def test_another_run_starts_from_the_beginning(tmp_path: Path, case: str) -> Non
     assert sorted(os.listdir(tmp_path)) == [*(path.name for path in files), "map"]
 
 
-@pytest.mark.parametrize("damage", ["short", "gone", "state", "boot"])
+@pytest.mark.parametrize("damage", ["short", "gone", "state", "boot", "bit", "journal", "link", "two names"])
 def test_a_state_that_is_no_use_is_no_danger(tmp_path: Path, damage: str) -> None:
     files, columns = inputs(tmp_path, "binary")
     interrupted(files, tmp_path / "map", 4200)
@@ -150,6 +150,17 @@ def test_a_state_that_is_no_use_is_no_danger(tmp_path: Path, damage: str) -> Non
         os.truncate(cell, 100)
     elif damage == "gone":
         cell.unlink()
+    elif damage == "bit":
+        data = bytearray(cell.read_bytes())
+        data[-30] ^= 1
+        cell.write_bytes(data)
+    elif damage == "journal":
+        (space / "pieces").unlink()
+    elif damage == "link":
+        cell.rename(tmp_path / "aside")
+        cell.symlink_to(tmp_path / "aside")
+    elif damage == "two names":
+        os.link(cell, tmp_path / "aside")
     elif damage == "state":
         (space / "state.json").write_text("{")
     else:
@@ -159,6 +170,25 @@ def test_a_state_that_is_no_use_is_no_danger(tmp_path: Path, damage: str) -> Non
     made = resumed(files, tmp_path / "map")
     assert made.resumed_points == 0
     assert map_rows(tmp_path / "map") == expected_rows(rows_of(columns))
+
+
+def test_nothing_else_gets_into_a_resumed_map(tmp_path: Path) -> None:
+    """What lies beside the cells of an interrupted run, or among them, is removed; links are not followed."""
+    files, columns = inputs(tmp_path, "binary")
+    interrupted(files, tmp_path / "map", 4200)
+    victim = tmp_path / "victim"
+    victim.mkdir()
+    (victim / "mine").write_text("mine")
+    content = tmp_path / ".map.dividing" / "map"
+    (content / "pointcloud_map_metadata.yaml").symlink_to(victim / "mine")
+    (content / "more").mkdir()
+    (content / "pointcloud_map.pcd" / "0_0_0.pcd").write_text("x")
+    made = resumed(files, tmp_path / "map")
+    assert made.resumed_points > 0
+    assert map_rows(tmp_path / "map") == expected_rows(rows_of(columns))
+    assert len(list((tmp_path / "map" / "pointcloud_map.pcd").iterdir())) == made.cells
+    assert not (tmp_path / "map" / "more").exists()
+    assert (victim / "mine").read_text() == "mine"
 
 
 def test_two_runs_do_not_mix(tmp_path: Path) -> None:

@@ -12,11 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from shmmap.errors import CannotWrite
 from shmmap.formats.source_file import refusal
 from shmmap.layers import sources
 from shmmap.layers.build import Made, cache_key, make_layer
 from shmmap.layers.contract import Box
-from shmmap.layers.disk_cache import CacheKey, LayerCache
+from shmmap.layers.disk_cache import CacheKey, LayerCache, _version_path
 from shmmap.layers.sources import CellJob, CellSource, Neighbour
 from shmmap.layers.spec import parse_layer
 from shmmap.segment.layout import SourceStamp
@@ -26,6 +27,10 @@ from tests.support.skips import open3d_or_skip
 
 BOX = (0.0, 0.0, 20.0, 20.0)
 LAYERS = ["points", "ndt(leaf=2.0,min_points=3)", "voxel(leaf=0.5)", "elevation(resolution=1.0)"]
+
+
+def version_file(one: Bench, key: CacheKey) -> Path:
+    return Path(one.cache.directory, _version_path(key))
 
 
 class Bench:
@@ -75,7 +80,7 @@ def test_the_same_bytes_come_back(one: Bench, layer: str) -> None:
     assert found.cached
     assert again == first
     assert repr(found.header) == repr(built.header)
-    state = Path(one.cache._version_path(one.key(layer).version_name()))
+    state = version_file(one, one.key(layer))
     assert state.read_bytes() == first  # a prepared file has the segment's bytes, its publish block empty
     assert len(one.files()) == 2
 
@@ -103,7 +108,7 @@ def test_any_damage_is_noticed_and_built_again(one: Bench) -> None:
     inside = [at for c in columns for at in range(c.offset, c.offset + c.nbytes)]
     places = [*range(0, 288, 37), 4095 - 70, *rng.choice(inside, 20).tolist()]
     for at in places:
-        state = Path(one.cache._version_path(one.key(layer).version_name()))
+        state = version_file(one, one.key(layer))
         with state.open("r+b") as file:
             file.seek(at)
             byte = file.read(1)
@@ -114,7 +119,7 @@ def test_any_damage_is_noticed_and_built_again(one: Bench) -> None:
         assert data == true, at
         assert one.make(layer)[0].cached
     for length in (0, 100, 4096, size - 1):
-        state = Path(one.cache._version_path(one.key(layer).version_name()))
+        state = version_file(one, one.key(layer))
         os.truncate(state, length)
         made, data = one.make(layer)
         # what lies after the last column is padding
@@ -125,7 +130,7 @@ def test_any_damage_is_noticed_and_built_again(one: Bench) -> None:
 def test_what_others_could_have_written_is_not_used(one: Bench) -> None:
     layer = LAYERS[1]
     _, true = one.make(layer)
-    state = Path(one.cache._version_path(one.key(layer).version_name()))
+    state = version_file(one, one.key(layer))
     os.chmod(state, 0o666)
     made, data = one.make(layer)
     assert not made.cached
@@ -144,19 +149,47 @@ def test_another_cell_s_entry_in_its_place_is_not_used(one: Bench) -> None:
     one.make(layer, there)
     key, other = one.key(layer), cache_key(parse_layer(layer), there)
     assert other is not None
-    shutil.copyfile(
-        one.cache._version_path(other.version_name()), one.cache._version_path(key.version_name())
-    )
+    shutil.copyfile(version_file(one, other), version_file(one, key))
     assert not one.cache.has(key)
     made, data = one.make(layer)
     assert not made.cached
     assert data == true
 
 
+@pytest.mark.parametrize("kind", ["link", "writable"])
+def test_a_directory_that_may_be_another_account_s_is_not_used(one: Bench, kind: str) -> None:
+    """Nothing is read, written or removed there; an entry whose file is a pipe does not block."""
+    key, aside = one.key(LAYERS[1]), one.directory / "aside"
+    one.make(LAYERS[1])
+    one.cache.make()
+    place = Path(one.cache.directory)
+    if kind == "link":
+        place.rename(aside)
+        place.symlink_to(aside)
+    else:
+        place.chmod(0o777)
+    before = sorted(place.rglob("*"))
+    assert not one.cache.has(key)
+    with pytest.raises(CannotWrite, match="layers cannot be kept"):
+        one.cache.make()
+    assert one.cache.is_empty
+    assert LayerCache(str(place.parent), limit_bytes=1).budget.trim() == 0
+    assert not one.make(LAYERS[1])[0].cached
+    assert sorted(place.rglob("*")) == before
+    if kind == "link":
+        place.unlink()
+        aside.rename(place)
+    place.chmod(0o755)
+    assert one.cache.has(key)
+    version_file(one, key).unlink()
+    os.mkfifo(version_file(one, key))
+    assert not one.cache.has(key)
+
+
 @pytest.mark.root
 def test_another_account_s_file_is_not_used(one: Bench) -> None:
     one.make(LAYERS[1])
-    os.chown(one.cache._version_path(one.key(LAYERS[1]).version_name()), 12345, -1)
+    os.chown(version_file(one, one.key(LAYERS[1])), 12345, -1)
     assert not one.cache.has(one.key(LAYERS[1]))
 
 
@@ -228,7 +261,7 @@ def test_the_least_recently_used_go_first(one: Bench) -> None:
     sizes = {}
     for number, layer in enumerate(LAYERS):
         sizes[layer] = one.make(layer)[0].header.total_bytes
-        os.utime(one.cache._version_path(one.key(layer).version_name()), (number, number))
+        os.utime(version_file(one, one.key(layer)), (number, number))
     interim = Path(one.cache.directory) / ".new-killed"
     interim.write_bytes(b"half")
     os.utime(interim, (1, 1))

@@ -221,3 +221,24 @@ def test_a_large_map_is_read_again_in_a_process_of_its_own(
     Path(origin.path, "pointcloud_map_metadata.yaml").unlink()
     with pytest.raises(TypeError):  # without metadata there is nothing to read apart
         origin.load(fresh=True)
+
+
+@pytest.mark.parametrize("plant", ["writable", "link", "pipe"])
+def test_a_sidecar_that_another_account_may_have_written_is_not_used(
+    origin: MapDirectory, plant: str
+) -> None:
+    origin.load()
+    rewrite_unseen(origin)
+    file = sidecar(origin)
+    if plant == "writable":
+        file.chmod(0o666)
+    elif plant == "link":
+        file.rename(file.with_suffix(".aside"))
+        file.symlink_to(file.with_suffix(".aside"))
+    else:
+        file.unlink()
+        os.mkfifo(file)
+    found = origin.load()
+    index = found.find(str(Path(origin.path) / "pointcloud_map.pcd" / "1" / "c_20_0.pcd"))
+    assert index is not None
+    assert found.source_bytes(index) == 77

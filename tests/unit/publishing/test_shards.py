@@ -18,7 +18,7 @@ from shmmap.origin.remote.published_index import LayerObjects, pack_shard, shard
 from shmmap.publishing.messages import CellSent, KnownObjects, LayerSent, write_known_objects  # noqa: E402
 from shmmap.publishing.shards import (  # noqa: E402
     CellObjects,
-    check_names,
+    check_cells,
     divide_into_shards,
     shard_side,
 )
@@ -98,7 +98,13 @@ def test_too_many_cells_at_one_place_or_too_far_out() -> None:
 def test_names_that_cannot_be_published(name: bytes) -> None:
     catalogue = catalogue_of([[0.0, 0, 20, 20]], [name])
     with pytest.raises(BadRequest, match="cannot be published"):
-        check_names(catalogue)
+        check_cells(catalogue)
+
+
+def test_cells_that_no_reader_takes() -> None:
+    for far in (-1e308, 1e13):
+        with pytest.raises(MapDataError, match="farther out than 1e\\+12 m"):
+            check_cells(catalogue_of([[min(far, 0.0), 0, max(far, 0.0), 20]], [b"a.pcd"]))
 
 
 def test_objects_are_found_by_their_content(tmp_path: Path) -> None:

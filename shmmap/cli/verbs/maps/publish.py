@@ -223,7 +223,8 @@ def _publish(args: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         complain("shmmap", "interrupted", "the same command continues")
         raise
-    return _report(args, origin.path, store.url, done, catalogue.problems, time.monotonic() - began_s)
+    notes = [*catalogue.problems, *done.notes]
+    return _report(args, origin.path, store.url, done, notes, time.monotonic() - began_s)
 
 
 def _report(

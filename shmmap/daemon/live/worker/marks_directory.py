@@ -14,6 +14,7 @@ import stat
 from typing import Final
 
 from shmmap.errors import BadRequest
+from shmmap.private_directory import PRIVATE, open_private
 
 __all__ = ["MAX_MARKS_BYTES", "MarksDirectory"]
 
@@ -41,12 +42,8 @@ class MarksDirectory:
 
     def __init__(self, path: str, gid: int = -1) -> None:
         self.path = path
-        with contextlib.suppress(FileExistsError):
-            os.mkdir(path, 0o700)
-        self._fd = os.open(path, os.O_DIRECTORY | os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+        self._fd = open_private(path, make=PRIVATE, refused=0)  # its mode may be another group's
         try:
-            if os.fstat(self._fd).st_uid != os.geteuid():
-                raise PermissionError(1, "it belongs to another user", path)
             if gid >= 0:
                 os.fchown(self._fd, -1, gid)
             os.fchmod(self._fd, 0o1770 if gid >= 0 else 0o700)

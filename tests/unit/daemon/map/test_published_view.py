@@ -8,13 +8,13 @@ import select
 import time
 import weakref
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
 import numpy as np
 import pytest
 
-from shmmap.errors import BadRequest
+from shmmap.errors import BadRequest, MapDataError
 from shmmap.geometry import Area, AutowareSquare, Box, Circle
 from shmmap.origin.catalogue import Catalogue
 from shmmap.segment.version import cell_version, layer_version
@@ -26,6 +26,7 @@ pytest.importorskip("zstandard", reason="zstandard is not installed")
 from shmmap.daemon.map.published_view import PublishedView
 from shmmap.daemon.map.shard_pages import BACKGROUND_FETCHES, THREADS, ShardFetcher, ShardPages
 from shmmap.layers.spec import layer_spec
+from shmmap.origin.remote.map_versions import read_shard_object
 from shmmap.origin.remote.published_index import (
     Root,
     map_version_of,
@@ -33,6 +34,7 @@ from shmmap.origin.remote.published_index import (
     pack_shard,
     published_layer_version,
     unpack_root,
+    unpack_shard,
 )
 from shmmap.origin.remote.published_object import blob_path, stamp_of, unpack_source
 from shmmap.origin.remote.store import Store
@@ -48,7 +50,10 @@ Cells = dict[str, tuple[tuple[float, float, float, float], bytes]]
 """By name: box, and content of the points, 32 bytes."""
 
 
-def publish(store: MemoryStore, cells: Cells, builder_version: int = OURS) -> Root:
+def publish(
+    store: MemoryStore, cells: Cells, builder_version: int = OURS, called: dict[bytes, bytes] | None = None
+) -> Root:
+    """Publish cells; ``called`` renames some in the shards, as no publisher does."""
     names = sorted(cells, key=str.encode)
     boxes = np.array([cells[name][0] for name in names])
     catalogue = Catalogue(
@@ -62,7 +67,8 @@ def publish(store: MemoryStore, cells: Cells, builder_version: int = OURS) -> Ro
         objects.set(row, CellSent(row, 1, 0.0, 1.0, layers))
     keys, counts, sizes, digests = [], [], [], []
     for key, shard in divide_into_shards(catalogue, objects, SIDE):
-        frame = pack_frame(pack_shard(shard))
+        names_here = tuple((called or {}).get(name, name) for name in shard.names)
+        frame = pack_frame(pack_shard(replace(shard, names=names_here)))
         digest, size = store.add(frame), len(frame)
         keys.append(key)
         counts.append(len(shard))
@@ -206,6 +212,29 @@ def test_each_cell_is_what_was_published(served: Served) -> None:
     assert seen == set(range(300))
     for wanted in ("nowhere.pcd", "/map/nowhere.pcd", "/other/1.pcd", "\udcff", "/map/", ""):
         assert view.find(wanted) is None
+
+
+def test_a_cell_in_two_shards_is_refused_with_the_second(
+    served: Served, caplog: pytest.LogCaptureFixture
+) -> None:
+    """No request waits for it, and what the first shard says of it stays."""
+    box, far, content = (0.0, 0.0, 1.0, 1.0), (500.0, 0.0, 501.0, 1.0), bytes(32)
+    cells = {"1.pcd": (box, content), "2.pcd": (far, content)}
+    root = publish(served.store, cells, called={b"2.pcd": b"1.pcd"})
+    view = served.view(root)
+    fetch(view.pages, [0])
+    view.pages.want([1], 0.0)
+    while not view.pages.is_out_of_reach(1):
+        collect(view.pages)
+    assert "its cell /map/1.pcd is in another shard, too" in caplog.text
+    index = view.find("/map/1.pcd")
+    assert index is not None
+    assert view.box(index) == box
+    assert view.query(Box(499.0, 0.0, 502.0, 2.0))[1] is False
+    store = cast("Store", served.store)
+    shards = {n: unpack_shard(read_shard_object(store, root, n), root, n) for n in range(2)}
+    with pytest.raises(MapDataError, match="two cells are called"):
+        PublishedView(root, 1, served.fetcher, shards, max_bytes=1 << 40)
 
 
 def test_base_names_are_found_where_they_are_unique(served: Served) -> None:

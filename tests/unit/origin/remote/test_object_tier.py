@@ -398,7 +398,7 @@ def test_many_threads(origin: Origin, cache: Path) -> None:
         made[hashlib.sha256(data).digest()] = data
     for name, data in made.items():
         (origin.directory / blob_path(name)).write_bytes(data)
-    tier = ObjectTier(str(cache), limit_bytes=40_000)
+    tier = ObjectTier(str(cache), limit_bytes=20 * 4096)
     cells, pages = KeptObjects(origin, tier), KeptObjects(origin, tier, is_index=True)
 
     def read(name: bytes) -> None:
@@ -408,8 +408,8 @@ def test_many_threads(origin: Origin, cache: Path) -> None:
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(read, random_.choices(list(made), k=1500)))
     wait_for_trimming()
-    total = sum(path.stat().st_size for path in cache.rglob("*") if path.is_file())
-    assert 20_000 < total <= 40_000 * 17 / 16
+    total = sum(path.stat().st_blocks * 512 for path in cache.rglob("*") if path.is_file())
+    assert 10 * 4096 < total <= 20 * 4096 * 17 / 16
     counts = [sum(both) for both in zip(cells.counts, pages.counts, strict=True)]
     assert counts[0] + counts[2] == 1500
     assert counts[0] > 300
@@ -439,8 +439,8 @@ def test_what_is_kept_while_the_directory_is_trimmed_is_trimmed_too(
 
 def test_the_pages_of_the_version_in_use_stay(cache: Path) -> None:
     """Pages read long ago are marked as used when a version comes that has them too."""
-    tier = ObjectTier(str(cache), limit_bytes=100_000)
-    pages = [random.Random(n).randbytes(5000) for n in range(8)]
+    tier = ObjectTier(str(cache), limit_bytes=5 * 4 * 4096)
+    pages = [random.Random(n).randbytes(4096) for n in range(8)]
     names = [hashlib.sha256(page).digest() for page in pages]
     for number, (name, page) in enumerate(zip(names, pages, strict=True)):
         tier.put(name, page, is_index=True)
@@ -450,7 +450,7 @@ def test_the_pages_of_the_version_in_use_stay(cache: Path) -> None:
         data = random.Random(100 + number).randbytes(4000)
         tier.put(hashlib.sha256(data).digest(), data)
         wait_for_trimming()
-    left = [tier.get(name, 5000, is_index=True) is not None for name in names]
+    left = [tier.get(name, 4096, is_index=True) is not None for name in names]
     assert left == [True, True, False, False, False, True, True, True]
 
 

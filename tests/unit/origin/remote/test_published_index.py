@@ -204,6 +204,11 @@ def altered(**changes: Any) -> bytes:
         ({"shard_sha256": bytes(31)}, "not of one length"),
         ({"cells": "two"}, "MessagePack"),
         ({"origin": [1.0, 2.0]}, "MessagePack"),
+        ({"bounds": [-1e308, 0.0, 1e308, 1.0]}, "out of range"),
+        ({"origin": [0.0, 1e300, 0.0]}, "out of range"),
+        ({"shard_m": 1e13}, "out of range"),
+        ({"largest_m": [1e308, 1.0]}, "out of range"),
+        ({"unit_m": [1e-300, 1.0]}, "out of range"),
     ],
 )  # fmt: skip
 def test_a_root_that_contradicts_itself(changes: dict[str, Any], why: str) -> None:
@@ -266,6 +271,8 @@ def test_names_that_leave_the_map_are_refused(names: tuple[bytes, ...]) -> None:
         ({"boxes": ONE.boxes[:1]}, "not of one length"),
         ({"z": np.array([[2.0, 1.0], [0, 0]])}, "above its highest"),
         ({"z": np.array([[math.nan, 1.0], [0, 0]])}, "above its highest"),
+        ({"z": np.array([[0.0, 1e308], [0, 0]])}, "out of range"),
+        ({"boxes": ONE.boxes + 1e300}, "out of range"),
         ({"points": np.array([1], np.uint32)}, "not of one length"),
         ({"layers": {"points": objects(0)}}, "its layers"),
         ({"layers": {"points": objects(0), "voxel(leaf=1.0)": objects(1)}}, "its layers"),

@@ -169,7 +169,7 @@ def test_another_user_s_directory_is_not_used(path: Path) -> None:
     path.mkdir()
     os.chown(path, MEMBER, -1)
     before = len(os.listdir("/proc/self/fd"))
-    with pytest.raises(PermissionError, match="another user"):
+    with pytest.raises(PermissionError, match="belongs to user"):
         MarksDirectory(str(path))
     assert len(os.listdir("/proc/self/fd")) == before
 
@@ -177,7 +177,7 @@ def test_another_user_s_directory_is_not_used(path: Path) -> None:
 def test_a_link_in_its_place_is_not_followed(path: Path, tmp_path: Path) -> None:
     (tmp_path / "keep").touch()
     path.symlink_to(tmp_path)
-    with pytest.raises(OSError, match=r"Not a directory|symbolic links"):
+    with pytest.raises(OSError, match=r"is a symbolic link"):
         MarksDirectory(str(path))
     assert (tmp_path / "keep").exists()
     path.unlink()
