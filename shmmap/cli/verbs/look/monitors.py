@@ -25,7 +25,7 @@ _HEALTH_EXIT = """\
 Exit code: 0 healthy, 1 starting, unreachable, paused or hung, 69 dead or never started; with --strict
 also 1 while clients lack something: cells were refused in the last minute, the map's files are out of
 reach, the map could not be read again or has problems, its signature has expired, the version that its origin
-offers is refused, or a live map has a problem."""
+offers is refused, or a live map has a problem, a damaged file or a missing chunk."""
 
 
 def add_health(subparsers: Subparsers) -> None:
@@ -82,6 +82,10 @@ def _troubles(found: Snapshot) -> list[str]:
         (counts.get("refused_over_budget_1min", 0), "cells refused for lack of memory in the last minute"),
         (counts.get("map_problems", 0), "problems in the map (`shmmap doctor`)"),
         (sum(bool(row.problem) for row in found.live), "live maps with a problem (`shmmap live ls`)"),
+        (
+            sum(row.damaged_count for row in found.live),
+            "damaged files or missing chunks of live maps (`shmmap live ls` names them)",
+        ),
     )
     troubles = [f"{count:,} {text}" for count, text in counted_troubles if count]
     if counts.get("origin_out", 0):

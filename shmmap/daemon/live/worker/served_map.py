@@ -10,7 +10,6 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
-from itertools import chain, islice
 from typing import Final, Protocol, TypeVar
 
 import msgspec
@@ -43,6 +42,8 @@ MAX_AHEAD_CHUNKS: Final = 4.0
 MARKS_PART: Final = 2
 """Divisor of the budget for the marks of one scan, which are in shared memory until they are accepted."""
 MANIFEST_S: Final = 60.0
+MAX_LOSSES: Final = 64
+"""Most damaged files and missing chunks that are named; all are counted."""
 FILES_S: Final = 0.5
 """Interval at which the sizes of files are summed."""
 
@@ -328,7 +329,9 @@ class ServedMap:
         if self._saves:
             self._answer_saves()
         self.readers.run_turn(now_s)
-        if now_s >= self._manifest_s and self.changes.number != self._listed:
+        due = now_s >= self._manifest_s and self.changes.number != self._listed
+        if due or self.live.files.manifest_is_due:
+            self.live.files.manifest_is_due = False
             self._manifest_s, self._listed = now_s + MANIFEST_S, self.changes.number
             self.live.list_files(self._durable_scans())
 
@@ -347,9 +350,7 @@ class ServedMap:
         if now_s >= self._files_s:
             self._files_s = now_s + FILES_S
             self._file_bytes = sum(row.bytes for row in list(live.files.rows.values()))  # other threads save
-        missing = (f"{key.text}: version {row.version} is missing" for key, row in live.files.missing.items())
-        quarantined = list(live.files.damaged.items())
-        damaged = (f"{name}: {why}" for name, why in quarantined)
+        losses, losses_count = live.files.losses(MAX_LOSSES)
         return messages.LiveMapRow(
             self.settings.name,
             self.settings.path,
@@ -367,13 +368,13 @@ class ServedMap:
             scans=self._scans,
             durable=self._durable,
             budget_bytes=live.limits.budget_bytes,
-            damaged=tuple(islice(chain(missing, damaged), 64)),
+            damaged=losses,
             mappers=tuple(f"{one.mapper.uid}/{one.mapper.name}" for one in self.mappers.by_number.values()),
             problem=live.problem,
             change=self.changes.number,
             beside_bytes=residency.beside_bytes,
             readers=self.readers.busiest,
-            damaged_count=len(live.files.missing) + len(quarantined),
+            damaged_count=losses_count,
             mapper_count=len(self.mappers.by_number),
         )
 
