@@ -359,6 +359,7 @@ def test_the_manifest_lists_what_is_durable() -> None:
             "0_0_0": {"version": 4, "bytes": 2688, "active": 0, "occupied": 0, "free": 0, "bricks": 0}
         },
         "applied": {},
+        "missing": {},
     }
     disk.remove("0_0_0.chunk")
     assert list(MapFiles(disk, SETTINGS).missing) == [KEYS[0]]
