@@ -372,6 +372,8 @@ class MapFiles:
                         self.files.sync(name)
                         self.files.rename(name, place)
                         continue
+                elif CHUNK in name and self.files.size(name):
+                    log.warning("unfinished file of a live map removed", file=name, reason="it is damaged")
                 self.files.remove(name)
 
     def _read_rows(self) -> None:
