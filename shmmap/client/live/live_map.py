@@ -19,8 +19,9 @@ from shmmap.chunks.voxels import ChunkKey, voxel_centers
 from shmmap.client.arguments import checked_seconds
 from shmmap.client.connection import until_served
 from shmmap.client.live.chunk_reader import ChunkInfo, ChunkReader, Place
+from shmmap.client.live.problems import with_problem
 from shmmap.client.session import Session
-from shmmap.errors import BadRequest, SegmentCorrupt, SegmentError, StaleHandle
+from shmmap.errors import BadRequest, NoAnswer, SegmentCorrupt, SegmentError, StaleHandle
 from shmmap.lacking import warn_of_lost_chunks
 from shmmap.lazy_imports import needed_packages
 from shmmap.protocol import live as messages
@@ -124,9 +125,16 @@ class LiveMap:
 
     def _ask(self, make: Callable[[int], messages.LiveRequest], kind: type[R], *, quiet_s: float = 0.0) -> R:
         """Send a request; repeat it while the process that keeps live maps is restarting."""
-        return until_served(
-            lambda: self._session.ask(make, kind, quiet_s=quiet_s), self._session.timeout_s + quiet_s
-        )
+        try:
+            return until_served(
+                lambda: self._session.ask(make, kind, quiet_s=quiet_s), self._session.timeout_s + quiet_s
+            )
+        except NoAnswer as error:
+            if kind is messages.LiveListed:
+                raise
+            raise with_problem(
+                error, self.name, lambda: self._session.ask(messages.LiveList, messages.LiveListed)
+            ) from error
 
     @property
     def occupancy(self) -> Occupancy:

@@ -423,9 +423,10 @@ class PagedMap:
                 known_mappers=known,
             )
         except OSError as error:  # no memory: treated as if the budget did not allow it
-            log.warning("chunk cannot grow", chunk=chunk.key.text, reason=error.strerror)
+            self._failed("enlarged", chunk.key.text, _reason(error))
             self.residency.may_grow(chunk, self.limits.budget_bytes)
             return
+        self._succeeded("enlarged")
         version, active = int(file.view.state["version"]), int(file.view.state["active"])
         self.residency.applied(chunk, scan, version=version, nbytes=file.nbytes, active=active, now_s=now_s)
         self._observer.chunk_changed(chunk.key)
