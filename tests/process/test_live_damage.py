@@ -12,6 +12,7 @@ import os
 import shutil
 import stat
 import subprocess
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,10 +22,11 @@ import numpy as np
 import pytest
 
 import shmmap
+from shmmap.chunks.voxels import ChunkKey
 from shmmap.errors import BadRequest, CannotWrite, LiveInterrupted
 from shmmap.protocol.live import LiveMapRow
 from tests.process.conftest import DaemonFactory
-from tests.support.command_line import doctor
+from tests.support.command_line import Shmmap, doctor, health
 from tests.support.daemon_process import Deadline
 from tests.support.disks import HangingDirectory
 from tests.support.divided_map import DividedMap
@@ -189,6 +191,107 @@ def test_each_damage_is_one_map_s_problem_until_it_is_mended(
         until_problems(client, set())
         for name in names:
             assert held(client.live(name)) == voxels, name
+    assert served.stop() == 0
+
+
+def damaged_body(directory: Path) -> None:
+    path = largest(directory)
+    data = bytearray(path.read_bytes())
+    data[-1] ^= 1
+    path.write_bytes(data)
+
+
+def damaged_header(directory: Path) -> None:
+    os.truncate(largest(directory), 50)
+
+
+def of_another(directory: Path) -> None:
+    path = largest(directory)
+    others = (one for one in directory.glob("*.chunk") if one != path)
+    shutil.copy(next(others), path)
+
+
+LOSSES: dict[str, Callable[[Path], object]] = {
+    "body": damaged_body, "header": damaged_header, "other": of_another,
+    "gone": lambda directory: largest(directory).unlink(), "late": damaged_body,
+    "vanished": lambda directory: largest(directory).unlink(),
+}  # fmt: skip
+WHILE_RUNNING = {"late", "vanished"}
+
+
+def test_what_is_lost_is_named_by_every_verb_and_every_reader(
+    daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path
+) -> None:
+    """No voxel is missing in silence, until the loss is forgotten on purpose."""
+    voxels = stored_drive(tmp_path / "good", 2)
+    lost = ChunkKey.from_text(largest(tmp_path / "good").name.removesuffix(".chunk"))
+    left = {voxel: value for voxel, value in voxels.items() if ChunkKey(*(i >> 6 for i in voxel)) != lost}
+    for name, damage in LOSSES.items():
+        shutil.copytree(tmp_path / "good", tmp_path / name)
+        if name not in WHILE_RUNNING:
+            damage(tmp_path / name)
+    options = ("--config", str(settings(tmp_path, "good", *LOSSES)), "--live-budget", "64M")
+    served = daemon(divided_map.root, *options)
+    shmmap_verb = Shmmap(served, tmp_path)
+
+    def all_say_so() -> None:
+        with shmmap.connect(served.endpoint, timeout=60.0) as client:
+            until_problems(client, set())
+            assert not client.live("good").lost()
+            for name in LOSSES:
+                live = client.live(name)
+                with pytest.warns(
+                    shmmap.ShmmapWarning, match=f"live map {name}: .* lost of 1 chunk:\n{lost.text}"
+                ):
+                    assert held(live, "disk") == left, name
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")
+                    for scope in ("memory", "disk", "all"):
+                        assert list(live.voxels(scope=scope).lacking) == [lost], (name, scope)
+                    assert held(live) == left, name
+                with pytest.warns(shmmap.ShmmapWarning, match=lost.text):
+                    client.live(name).log_odds([[0.0, 0.0, 0.0]])
+                assert list(live.lost()) == [lost]
+        waiting = Deadline()
+        while waiting(health(served)[1].count(lost.text) < len(LOSSES)):
+            pass
+        assert health(served)[0] == 1
+        assert "live map good" not in health(served)[1]
+        said = shmmap_verb("live", "ls")
+        assert all(f"{name}: {lost.text}" in said for name in LOSSES), said
+        finding = doctor(served)[1]["live maps"]
+        assert (finding["state"], f"{len(LOSSES)} (" in finding["fact"]) == ("warn", True), finding
+        for name in LOSSES:
+            found = shmmap_verb.json("live", "fsck", "--read-only", str(tmp_path / name), code=65)
+            assert [one["chunk"] for one in found["missing"]] == [lost.text], name
+            done = shmmap_verb.run(
+                "live", "export", str(tmp_path / name), "-o", "out.ply", "--voxels", "both", "--force"
+            )
+            assert (done.returncode, lost.text in done.stderr) == (0, True), done
+            assert f"{len(left):,} of" in done.stdout
+
+    with shmmap.connect(served.endpoint, timeout=60.0) as client:
+        until_problems(client, set())
+    for name in WHILE_RUNNING:
+        LOSSES[name](tmp_path / name)
+    with shmmap.connect(served.endpoint, timeout=60.0) as client, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for name in LOSSES:
+            client.live(name).voxels(scope="all")
+    all_say_so()
+    served.kill()
+    served.start()
+    all_say_so()
+    assert served.stop() == 0
+    for name in LOSSES:
+        shmmap_verb.json("live", "fsck", "--repair", str(tmp_path / name), code=65)
+    served.start()
+    with shmmap.connect(served.endpoint, timeout=60.0) as client, warnings.catch_warnings():
+        warnings.simplefilter("error")
+        until_problems(client, set())
+        for name in LOSSES:
+            assert held(client.live(name)) == left
+    assert health(served)[0] == 0
     assert served.stop() == 0
 
 

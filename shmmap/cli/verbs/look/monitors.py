@@ -28,6 +28,10 @@ reach, the map could not be read again or has problems, its signature has expire
 offers is refused, or a live map has a problem, a damaged file or a missing chunk."""
 
 
+_NAMED = 3
+"""Damaged files that are named, at most."""
+
+
 def add_health(subparsers: Subparsers) -> None:
     """Add the verb ``health``."""
     parser = add_verb(
@@ -82,12 +86,14 @@ def _troubles(found: Snapshot) -> list[str]:
         (counts.get("refused_over_budget_1min", 0), "cells refused for lack of memory in the last minute"),
         (counts.get("map_problems", 0), "problems in the map (`shmmap doctor`)"),
         (sum(bool(row.problem) for row in found.live), "live maps with a problem (`shmmap live ls`)"),
-        (
-            sum(row.damaged_count for row in found.live),
-            "damaged files or missing chunks of live maps (`shmmap live ls` names them)",
-        ),
     )
     troubles = [f"{count:,} {text}" for count, text in counted_troubles if count]
+    troubles += [
+        f"live map {row.name}: {row.damaged_count:,} damaged files or missing chunks: "
+        + ("; ".join(row.damaged[:_NAMED]) or "`shmmap live ls` names them")
+        for row in found.live
+        if row.damaged_count
+    ]
     if counts.get("origin_out", 0):
         troubles.append("no load succeeds: the map's files are out of reach (`shmmap doctor`)")
     troubles += trust_problems(counts, time.time())
