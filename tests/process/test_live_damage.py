@@ -22,10 +22,12 @@ import numpy as np
 import pytest
 
 import shmmap
+from shmmap.chunks.marking import Marker
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.errors import BadRequest, CannotWrite, LiveInterrupted
+from shmmap.errors import BadRequest, Busy, CannotWrite, LiveInterrupted, NoAnswer
 from shmmap.protocol.live import LiveMapRow
 from tests.process.conftest import DaemonFactory
+from tests.support.chunk_memory import ChunkMemory
 from tests.support.command_line import Shmmap, doctor, health
 from tests.support.daemon_process import Deadline
 from tests.support.disks import HangingDirectory
@@ -395,6 +397,66 @@ def test_a_full_disk_at_the_start_and_at_the_end(
     with shmmap.connect(served.endpoint, timeout=60.0) as client:
         assert held(client.live("full")) == reference(scans)
     assert served.stop() == 0
+
+
+@pytest.mark.root
+def test_a_mapper_says_that_the_disk_is_full_and_goes_on_when_there_is_room(
+    live_daemon: LiveDaemon, tmp_path: Path, private_tmpfs: Callable[[str], str]
+) -> None:
+    """What the daemon knows is in the mapper's and the reader's error; nothing that was taken is lost."""
+    disk, scans = Path(private_tmpfs("128k")), drive(40)
+    (tmp_path / "lidar").symlink_to(disk)
+    one = live_daemon("--live-budget", "4M", resolution=0.05)
+    taken: list[int] = []
+    with shmmap.connect(one.endpoint, timeout=60.0) as client:
+        live = client.live("lidar")
+        with live.mapper("front", FILTER, timeout_s=3.0) as mapper:
+
+            def add_all() -> None:
+                for points, pose in scans[len(taken) :]:
+                    mapper.add(points, pose)
+                    taken.append(mapper.applied)
+                mapper.wait_applied()
+
+            with pytest.raises(Busy, match=r"live map lidar: a scan waits: .*No space left on device"):
+                add_all()
+            assert len(taken) > 3
+            with pytest.raises(Busy, match="No space left on device"):
+                mapper.wait_durable()
+            with (
+                shmmap.connect(one.endpoint, timeout=0.5) as hasty,
+                pytest.raises(NoAnswer, match=r"live map lidar waits: .*No space left on device"),
+            ):
+                hasty.live("lidar").save(timeout_s=0.5)
+            subprocess.run(["mount", "-o", "remount,size=64m", str(disk)], check=True)
+            waiting = Deadline()
+            while waiting(mapper.applied < len(taken)):
+                pass
+            mapper.wait_durable()
+        sent = len(taken)
+        found = {kind: len(live.voxels(kind, scope="all")) for kind in ("occupied", "free")}
+    assert one.stop() == 0
+    memory = ChunkMemory(0.05)
+    for number, (points, pose) in enumerate(scans[:sent], 1):
+        memory.apply(Marker(0.05, FILTER).mark(points, pose)[0], scan=number)
+    values = list(memory.voxels().values())
+    assert found == {
+        "occupied": sum(value > 0 for value in values),
+        "free": sum(value < 0 for value in values),
+    }
+
+
+@pytest.mark.root
+def test_live_maps_alone_get_what_is_there(
+    daemon: DaemonFactory, tmp_path: Path, private_tmpfs: Callable[[str], str]
+) -> None:
+    """Nothing is set aside for a map of points that is not served."""
+    for size in (64, 2048):
+        one = daemon("", "--config", str(settings(tmp_path, "lidar")), shm_dir=private_tmpfs(f"{size}m"))
+        with shmmap.connect(one.endpoint, timeout=60.0) as client:
+            (row,) = client.live_maps()
+        assert min(size * 0.85, 900) <= row.budget_bytes / 2**20 <= size * 0.95
+        assert one.stop() == 0
 
 
 def test_a_directory_that_is_moved_or_replaced(live_daemon: LiveDaemon, tmp_path: Path) -> None:

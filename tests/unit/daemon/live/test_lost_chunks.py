@@ -158,7 +158,7 @@ def damaged(serve: Serve, shm: Path, tmp_path: Path) -> Damaged:
 def test_what_is_lost_is_named_by_all_until_it_is_forgotten(
     damaged: Damaged, name: str, when: str, noticed: str
 ) -> None:
-    """Whoever notices it first; over a restart, and when the chunk was mapped again."""
+    """Whatever notices it first; over a restart, and when the chunk was mapped again."""
     if when == "running":
         served = damaged.serve()
         damaged.damage(name)

@@ -110,7 +110,7 @@ def test_a_damaged_file_is_quarantined_and_never_overwritten(tmp_path: Path) -> 
         "7_7_7.chunk.damaged.1",
     ]
     assert again.rows == {}
-    assert set(again.missing) == {*KEYS, ChunkKey(7, 7, 7)}, "of which nobody knows what it was"
+    assert set(again.missing) == {*KEYS, ChunkKey(7, 7, 7)}, "of which it is not known what it was"
     again.save(KEYS[0], chunk(again, KEYS[0], 1))
     again.flush()
     assert again.quarantine(KEYS[0], "its body is damaged") == "0_0_0.chunk.damaged.2"
