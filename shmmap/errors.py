@@ -252,7 +252,7 @@ class LimitReached(ShmmapError):
 
 
 class Busy(ShmmapError):
-    """Too many requests of this process wait for their answers: wait for some."""
+    """Too many requests wait for their answers, or a live map waits for room: the message says for which."""
 
     code = "busy"
     exit_code = 75

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from shmmap.client.client import Client
     from shmmap.errors import CellError
     from shmmap.geometry import Area
+    from shmmap.protocol.live import LackingChunk
     from shmmap.protocol.messages import Holder, Welcome
 
 __all__ = [
@@ -32,11 +33,13 @@ __all__ = [
     "not_covered",
     "pending_lines",
     "unknown_ids",
+    "warn_of_lost_chunks",
 ]
 
 _NOT_COVERED: Final = "the daemon does not know yet all that the map has there"
 _OUT_OF_REACH: Final = "the list of cells there cannot be reached at present"
 _NAMED_CELLS: Final = 3
+_NAMED_CHUNKS: Final = 5
 _MAX_CELLS: Final = 20_000  # searching them for similar ids takes at most a second
 _MAX_LINES: Final = 10  # of a warning
 
@@ -86,6 +89,18 @@ def judge(
         lines[_MAX_LINES:] = [f"... and {len(lines) - _MAX_LINES} more"]
     if found.failed or (found.pending and waited):
         lines.insert(0, f"{len({cell.id for cell in found}):,} of {_asked(found):,} cells are there:")
+    warnings.warn("\n".join(lines), ShmmapWarning, stacklevel=_level_of_program())
+
+
+def warn_of_lost_chunks(name: str, lacking: Sequence[LackingChunk], count: int) -> None:
+    """Warn, at the program's call, that a live map has lost something of ``count`` chunks, named or not."""
+    if not count:
+        return
+    lines = [f"live map {name}: something that was saved is lost of {counted(count, 'chunk')}:"]
+    lines += [f"{'_'.join(map(str, one.key))}: {one.reason}" for one in lacking[:_NAMED_CHUNKS]]
+    if count > _NAMED_CHUNKS:
+        lines.append(f"... and {count - _NAMED_CHUNKS:,} more")
+    lines.append("hint: `shmmap live ls` names the files; `shmmap live fsck --repair` forgets what is lost")
     warnings.warn("\n".join(lines), ShmmapWarning, stacklevel=_level_of_program())
 
 

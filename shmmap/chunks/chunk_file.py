@@ -39,6 +39,7 @@ __all__ = [
     "FILE_HEADER_BYTES",
     "ChunkFileHeader",
     "check_file",
+    "check_identity",
     "decode_chunk",
     "encode_chunk",
     "read_file_header",
@@ -225,6 +226,26 @@ def check_file(data: bytes, path: str = "") -> ChunkFileHeader:
     return header
 
 
+def check_identity(header: ChunkFileHeader, identity: ChunkIdentity, path: str = "") -> None:
+    """Check that a header is that of this chunk of this map.
+
+    Raises
+    ------
+    MapDataError
+        It is another chunk's, of another map, or of voxels of another size.
+    """
+    if (header.map_id, header.key) != (identity.map_id, identity.key):
+        raise MapDataError(
+            f"it is chunk {header.key.text} of map {header.map_id.hex()}, not {identity.key.text} of"
+            f" {identity.map_id.hex()}",
+            path=path, offset=16, cause="another_chunk",
+        )  # fmt: skip
+    if header.resolution != identity.resolution:
+        raise MapDataError(
+            f"its voxels are {header.resolution} m a side, not {identity.resolution} m", path=path, offset=104
+        )
+
+
 def decode_chunk(data: bytes, identity: ChunkIdentity, path: str = "") -> bytearray:
     """Return a saved chunk's bytes as they are in memory.
 
@@ -245,16 +266,7 @@ def decode_chunk(data: bytes, identity: ChunkIdentity, path: str = "") -> bytear
         The package for its codec is not installed.
     """
     header = read_file_header(data, path)
-    if (header.map_id, header.key) != (identity.map_id, identity.key):
-        raise MapDataError(
-            f"it is chunk {header.key.text} of map {header.map_id.hex()}, not {identity.key.text} of"
-            f" {identity.map_id.hex()}",
-            path=path, offset=16, cause="another_chunk",
-        )  # fmt: skip
-    if header.resolution != identity.resolution:
-        raise MapDataError(
-            f"its voxels are {header.resolution} m a side, not {identity.resolution} m", path=path, offset=104
-        )
+    check_identity(header, identity, path)
     check_file(data, path)
     stored = memoryview(data)[FILE_HEADER_BYTES:]
     expected = _FIXED_BYTES + header.bricks * BRICK_BYTES

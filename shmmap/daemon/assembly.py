@@ -117,7 +117,9 @@ class Service:
             due=self._inbox.add_work,
             clock=time.monotonic,
         )
-        sampler = Sampler(cache, survey, scheduler, statistics, memory.event_log, sessions, cells, self._beat)
+        sampler = Sampler(
+            cache, survey, scheduler, statistics, memory.event_log, sessions, watched, cells, self._beat
+        )
         self._pins = OperatorPins(cache, scheduler)
         queries = MapQueries(
             config,

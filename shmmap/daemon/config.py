@@ -267,7 +267,7 @@ class DaemonConfig:
         metavar="BYTES",
         allowed=at_least("4M"),
         size="live_budget",
-        unset="an eighth of what is free, at most 1 GiB",
+        unset="an eighth of the room shared with cells, all of it where no map is served; at most 1 GiB",
     )
     live_shm_dir: str = setting(
         "",

@@ -21,7 +21,13 @@ from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.config_live import LiveSettings, live_directory
 from shmmap.daemon.events.log import EventLog
-from shmmap.daemon.host.memory import choose_budget, loader_bytes, memory_limit_bytes
+from shmmap.daemon.host.memory import (
+    available_bytes,
+    choose_budget,
+    loader_bytes,
+    memory_limit_bytes,
+    room_bytes,
+)
 from shmmap.daemon.live.messages import Begin
 from shmmap.daemon.loading.adoption import Adoption
 from shmmap.daemon.loading.prepared_parent import Early, PreparedParent
@@ -34,6 +40,7 @@ from shmmap.daemon.requests.pending_request import WaitingList
 from shmmap.daemon.transport.sessions import Sessions
 from shmmap.daemon.turns import WatchedDescriptors
 from shmmap.errors import CannotStart, ConfigError
+from shmmap.logfmt import log
 from shmmap.mounts import mount_of
 from shmmap.segment.directory import DEFAULT_SHM_DIR, ShmDirectory, is_full
 from shmmap.segment.names import segment_prefix
@@ -42,17 +49,39 @@ from shmmap.statistics.identity import DaemonIdentity, pid_namespace, start_time
 from shmmap.statistics.writer import StatisticsWriter
 from shmmap.version import __version__
 
-__all__ = ["FetchedFrom", "MapInMemory", "bytes_beside_cells", "place_live_maps"]
+__all__ = ["FetchedFrom", "MapInMemory", "place_live_maps", "share_of_live_maps"]
 
 CEILING_BYTES: Final = 1 << 30
 PART: Final = 8
-"""Divisor: by default, live maps get 1/8 of the free memory."""
+"""Divisor: by default, live maps get 1/8 of the memory that they share with cells."""
+CELLS_WITHOUT_MAP: Final = 4 << 20
+"""Budget of cells if no map of points is served: the statistics count towards it."""
+FEW_BYTES: Final = 16 << 20
+"""A default share of less than this for a map is reported."""
 LEAST_BYTES: Final = 4 << 20
 """Minimum budget of a map: some of the largest chunks, half a mebibyte each."""
 
 
-def bytes_beside_cells(maps: int, *, cells: ShmDirectory, shm_dir: str, budget_bytes: int) -> int:
-    """Return the bytes that live maps need in the cells' file system: their budget, or the minimum."""
+def share_of_live_maps(
+    maps: int, *, cells: ShmDirectory, room: int, shm_dir: str, budget_bytes: int, alone: bool
+) -> int:
+    """Return the bytes that live maps get in the cells' file system: their budget, or by default a share.
+
+    Parameters
+    ----------
+    maps
+        Number of live maps.
+    room
+        Bytes of the file system for cells and live maps together.
+    shm_dir, budget_bytes
+        Settings for live maps; empty and 0 for the defaults.
+    alone
+        Whether no map of points is served, for which something would have to be left.
+
+    Returns
+    -------
+    0 if there are no live maps, or if their chunks are in another file system.
+    """
     if not maps:
         return 0
     path = shm_dir or _without_huge_pages(cells.path)
@@ -60,7 +89,13 @@ def bytes_beside_cells(maps: int, *, cells: ShmDirectory, shm_dir: str, budget_b
         same = os.stat(path).st_dev == os.stat(cells.path).st_dev
     except OSError:
         same = False  # `place_live_maps` raises the error
-    return (budget_bytes or LEAST_BYTES * maps) if same else 0
+    if not same:
+        return 0
+    return budget_bytes or _default_share(maps, room - CELLS_WITHOUT_MAP if alone else room // PART)
+
+
+def _default_share(maps: int, most: int) -> int:
+    return max(LEAST_BYTES * maps, min(most, available_bytes(), CEILING_BYTES))
 
 
 def place_live_maps(
@@ -69,6 +104,7 @@ def place_live_maps(
     instance: str,
     cells: ShmDirectory,
     cells_budget_bytes: int,
+    share_bytes: int,
     shm_dir: str,
     budget_bytes: int,
     gid: int,
@@ -80,6 +116,8 @@ def place_live_maps(
     ----------
     cells, cells_budget_bytes
         Directory and budget of the cells.
+    share_bytes
+        What `share_of_live_maps` returned.
     shm_dir, budget_bytes
         Settings for live maps; empty and 0 for the defaults.
     gid, marks_gid
@@ -97,6 +135,7 @@ def place_live_maps(
     try:
         size, free = directory.size_bytes(), directory.free_bytes()
         used = sum(directory.used_bytes(f"/shmmap-live.{instance}.{one.name}.") for one in live)
+        room = room_bytes(directory, used, memory_limit_bytes())
     finally:
         directory.close()
     if huge := mount_of(directory.path).huge_pages:
@@ -108,7 +147,8 @@ def place_live_maps(
     same = os.stat(directory.path).st_dev == os.stat(cells.path).st_dev
     beside = cells_budget_bytes if same else 0
     least = LEAST_BYTES * len(live)
-    budget = budget_bytes or max(least, min((free + used - beside) // PART, CEILING_BYTES))
+    default = max(least, min(share_bytes, free + used - beside)) if same else _default_share(len(live), room)
+    budget = budget_bytes or default
     if budget < least:
         raise ConfigError(
             f"{len(live)} live maps share {budget >> 20:,} MiB; each needs {LEAST_BYTES >> 20} MiB",
@@ -127,6 +167,13 @@ def place_live_maps(
             f"live maps of {budget >> 20:,} MiB do not fit in {directory.path}, which has"
             f" {free + used >> 20:,} MiB free",
             hint="free some, or lower --live-budget",
+        )
+    if not budget_bytes and budget < FEW_BYTES * len(live):
+        log.warning(
+            "live maps get little memory: chunks are read from the disk again and again",
+            budget=f"{budget >> 20}M",
+            directory=directory.path,
+            hint="set live_budget and budget, enlarge the tmpfs (docker: --shm-size), or set live_shm_dir",
         )
     maps = tuple(
         dataclasses.replace(one, path=one.path or live_directory(instance, one.name)) for one in live
@@ -151,6 +198,11 @@ class MapInMemory:
     """Parts with names in shared memory: the cache with its loaders, and the statistics.
 
     A previous run's segments are taken over.  `close` removes the names.
+
+    Attributes
+    ----------
+    live_bytes
+        What `share_of_live_maps` returned.
 
     Raises
     ------
@@ -180,16 +232,22 @@ class MapInMemory:
         epoch = secrets.randbits(63) | 1
         self.identity = _identity(config, catalogue, directory.path, socket_path, epoch)
         group_limit = memory_limit_bytes()
+        ours = directory.used_bytes(segment_prefix(config.instance))
+        if config.live:
+            ours += directory.used_bytes(f"/shmmap-live.{config.instance}.")
+        self.live_bytes = share_of_live_maps(
+            len(config.live),
+            cells=directory,
+            room=room_bytes(directory, ours, group_limit),
+            shm_dir=config.live_shm_dir,
+            budget_bytes=config.live_budget_bytes,
+            alone=not config.map_path,
+        )
         budget = choose_budget(  # may raise: before anything has a name
-            config.budget_bytes,
+            config.budget_bytes or (0 if config.map_path else CELLS_WITHOUT_MAP),
             directory,
-            ours_bytes=directory.used_bytes(segment_prefix(config.instance)),
-            beside_bytes=bytes_beside_cells(
-                len(config.live),
-                cells=directory,
-                shm_dir=config.live_shm_dir,
-                budget_bytes=config.live_budget_bytes,
-            ),
+            ours_bytes=ours,
+            beside_bytes=self.live_bytes,
             limit_bytes=group_limit,
         )
         ledger = Ledger(budget)

@@ -23,7 +23,7 @@ from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.daemon.requests.dispatch import Defects, Dispatch
 from shmmap.daemon.requests.operators.operator_requests import OperatorRequests
-from shmmap.daemon.telemetry.sampler import BEAT_S
+from shmmap.daemon.telemetry.sampler import IDLE_BEAT_S
 from shmmap.daemon.transport.inbox import Inbox
 from shmmap.daemon.turns import WatchedDescriptors
 from shmmap.protocol.events import LongTurn
@@ -128,9 +128,10 @@ class ServingLoop:
         until_s = min(
             self.scheduler.next_event_s(),
             self.cells.next_deadline_s(),
+            self.operators.stop_by_s,
             *(task.next_s for _kind, task in self.tasks),
         )
-        return min(max(0.0, until_s - time.monotonic()), BEAT_S)
+        return min(max(0.0, until_s - time.monotonic()), IDLE_BEAT_S)
 
     def _poll(self, timeout_s: float) -> list[int]:
         """End a turn, wait for descriptors, and begin the next turn."""

@@ -17,7 +17,8 @@ DESCRIPTORS_PER_TURN: Final = 16
 class WatchedDescriptors:
     """Callbacks of descriptors that are readable.
 
-    ``kinds`` are their kinds of turn, see `shmmap.statistics.counters.TURN_KINDS`.
+    ``kinds`` are their kinds of turn, see `shmmap.statistics.counters.TURN_KINDS`; ``wakes`` counts the polls
+    in which one was ready.
     """
 
     def __init__(self) -> None:
@@ -25,6 +26,7 @@ class WatchedDescriptors:
         self.callbacks: dict[int, Callable[[], None]] = {}
         self.kinds: dict[int, str] = {}
         self._again: list[int] = []
+        self.wakes = 0
 
     def watch(self, fd: int, callback: Callable[[], None], kind: str = "clients") -> None:
         """Call ``callback`` from the loop whenever ``fd`` is readable, or its peer has closed."""
@@ -50,6 +52,7 @@ class WatchedDescriptors:
         """Wait until descriptors are ready, at most ``timeout_s``, and return them."""
         again, self._again = self._again, []
         ready = self._epoll.poll(0 if again else timeout_s, DESCRIPTORS_PER_TURN)
+        self.wakes += bool(again or ready)
         return [*again, *(fd for fd, _events in ready)]
 
     def close(self) -> None:

@@ -16,7 +16,9 @@ from shmmap.protocol.rows import LiveMapRow
 __all__ = [
     "LIVE_REQUESTS",
     "MAX_CHUNK_ROWS",
+    "MAX_LACKING",
     "MAX_NAME_BYTES",
+    "LackingChunk",
     "LiveApplied",
     "LiveChunkPage",
     "LiveChunkRow",
@@ -42,6 +44,8 @@ __all__ = [
 MAX_NAME_BYTES: Final = 64
 MAX_CHUNK_ROWS: Final = 1000
 """Most rows of one page of chunks."""
+MAX_LACKING: Final = 64
+"""Most lacking chunks that an answer names."""
 
 Name: TypeAlias = Annotated[str, msgspec.Meta(max_length=MAX_NAME_BYTES)]
 Point: TypeAlias = tuple[float, float, float]
@@ -221,12 +225,19 @@ class LiveChunkRow(msgspec.Struct, array_like=True, frozen=True, gc=False):
     bytes: int
 
 
+class LackingChunk(msgspec.Struct, array_like=True, frozen=True, gc=False):
+    """A chunk of which something that was saved is lost, and what."""
+
+    key: Key
+    reason: str
+
+
 class LiveChunkPage(Message, tag="live_chunk_page"):
     """Answer to `LiveChunks`, in the order of keys; ``more`` is false on the last page.
 
     ``change`` is the number of the map's last change: send it as ``since`` to get later changes.  ``gone``
     lists chunks that left memory after ``since``.  ``since_known`` is false if the daemon no longer knew
-    ``since``, and the reply lists everything instead.
+    ``since``, and the reply lists everything instead.  The first page has ``lacking`` as `LiveVoxelsReply`.
     """
 
     change: int
@@ -234,18 +245,24 @@ class LiveChunkPage(Message, tag="live_chunk_page"):
     more: bool = False
     gone: tuple[Key, ...] = ()
     since_known: bool = True
+    lacking: tuple[LackingChunk, ...] = ()
+    lacking_count: int = 0
 
 
 class LiveVoxelsReply(Message, tag="live_voxels_reply"):
     """Answer to `LiveVoxels`: the segment with ``count`` voxels.
 
-    The segment's columns are ``voxel`` (3 x int32, indices) and ``log_odds`` (int16).
+    The segment's columns are ``voxel`` (3 x int32, indices) and ``log_odds`` (int16).  ``lacking`` names
+    chunks of the area, `MAX_LACKING` at most, of which something that was saved is lost, whether they were
+    mapped again or not; ``lacking_count`` is the number of all.
     """
 
     change: int
     segment: str
     count: int
     bytes: int
+    lacking: tuple[LackingChunk, ...] = ()
+    lacking_count: int = 0
 
 
 class LiveReleased(Message, tag="live_released"):

@@ -41,6 +41,7 @@ def _voxel_reply(live: LiveMap, message: Any, kind: str, scope: str) -> Content:
 
     The counts are from the daemon's list of chunks. For ``disk`` they include every chunk, and chunks in
     memory with their state there. ``memory_mb`` is the size of the map in memory, or of its files, in MiB.
+    ``success`` is false if something that was saved is lost of any chunk.
 
     Raises
     ------
@@ -57,7 +58,7 @@ def _voxel_reply(live: LiveMap, message: Any, kind: str, scope: str) -> Content:
     active = sum(row.active for row in rows)
     ratio = occupied / (occupied + free) if occupied + free else 0.0
     taken = status.file_bytes if scope == "disk" else status.bytes
-    writer.numbers("QQff?", count, active, ratio, taken / 2**20, True)
+    writer.numbers("QQff?", count, active, ratio, taken / 2**20, not live.lost())
     return writer.content()
 
 
@@ -125,11 +126,21 @@ class LiveWorker(Worker):
         self._live = live
         self._clouds = clouds
         self._published: dict[str, tuple[int, frozenset[int]]] = {}
+        self._lost: frozenset[str] = frozenset()
 
     def answer(self, message: Any, request: Request) -> Answer:
         """Return a reply with voxels."""
         _, kind, scope = LIVE_SERVICES[request.server.name.rpartition("/")[2]]
-        return _voxel_reply(self._live, message, kind, scope), no_followup
+        reply = _voxel_reply(self._live, message, kind, scope)
+        self._report_lost()
+        return reply, no_followup
+
+    def _report_lost(self) -> None:
+        """Log chunks of which something is lost, once each."""
+        lost = frozenset(f"{key.text}: {reason}" for key, reason in self._live.lost().items())
+        if new := lost - self._lost:
+            self._log(f"live map {self._live.name} has lost something of chunks: {'; '.join(sorted(new))}")
+        self._lost = lost
 
     def empty(self, message: Any) -> Content:
         """Return a reply without voxels."""
@@ -142,5 +153,6 @@ class LiveWorker(Worker):
             change = self._live.status().change if readers else 0
             before, had = self._published.get(kind, (-1, frozenset()))
             if readers and (change != before or readers - had):
+                self._report_lost()
                 writer.write(ready_made(PointCloud2, _voxel_cloud(self._live, kind)))
             self._published[kind] = (change if readers else -1, readers)

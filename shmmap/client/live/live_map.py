@@ -6,7 +6,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final, TypeVar
 
 import msgspec
@@ -19,8 +19,10 @@ from shmmap.chunks.voxels import ChunkKey, voxel_centers
 from shmmap.client.arguments import checked_seconds
 from shmmap.client.connection import until_served
 from shmmap.client.live.chunk_reader import ChunkInfo, ChunkReader, Place
+from shmmap.client.live.problems import with_problem
 from shmmap.client.session import Session
-from shmmap.errors import BadRequest, SegmentCorrupt, SegmentError, StaleHandle
+from shmmap.errors import BadRequest, NoAnswer, SegmentCorrupt, SegmentError, StaleHandle
+from shmmap.lacking import warn_of_lost_chunks
 from shmmap.lazy_imports import needed_packages
 from shmmap.protocol import live as messages
 from shmmap.protocol.areas import FURTHEST_M, BoxMessage, LiveArea, SphereMessage, area_to_message
@@ -66,12 +68,16 @@ class Voxels:
         Edge of a voxel, metres.
     change
         Number of the map's last change before the list was made; pass it as ``since`` to get later changes.
+    lacking
+        Chunks of the area of which something that was saved is lost, each with what: their file is damaged or
+        gone.  At most 64; a `ShmmapWarning` names them, too.
     """
 
     indices: NDArray[np.int32]
     log_odds: NDArray[np.int16]
     resolution: float
     change: int
+    lacking: dict[ChunkKey, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.log_odds)
@@ -107,6 +113,7 @@ class LiveMap:
         self.name = name
         self._frame_id = frame_id
         self._open()
+        self._warned: tuple[messages.LackingChunk, ...] = ()
         self._reader = ChunkReader(self._place, lambda since: self._pages(None, since))
 
     def _open(self) -> None:
@@ -118,9 +125,16 @@ class LiveMap:
 
     def _ask(self, make: Callable[[int], messages.LiveRequest], kind: type[R], *, quiet_s: float = 0.0) -> R:
         """Send a request; repeat it while the process that keeps live maps is restarting."""
-        return until_served(
-            lambda: self._session.ask(make, kind, quiet_s=quiet_s), self._session.timeout_s + quiet_s
-        )
+        try:
+            return until_served(
+                lambda: self._session.ask(make, kind, quiet_s=quiet_s), self._session.timeout_s + quiet_s
+            )
+        except NoAnswer as error:
+            if kind is messages.LiveListed:
+                raise
+            raise with_problem(
+                error, self.name, lambda: self._session.ask(messages.LiveList, messages.LiveListed)
+            ) from error
 
     @property
     def occupancy(self) -> Occupancy:
@@ -226,6 +240,9 @@ class LiveMap:
             )
             if change < 0:
                 change, known = page.change, page.since_known
+                if page.lacking != self._warned:  # each look-up asks for a page
+                    self._warned = page.lacking
+                    warn_of_lost_chunks(self.name, page.lacking, page.lacking_count)
                 gone = [ChunkKey(*key) for key in page.gone]
             for row in page.rows:
                 key = ChunkKey(*row.key)
@@ -235,6 +252,21 @@ class LiveMap:
             if not page.more or not page.rows:
                 return found, gone, change, known
             after = page.rows[-1].key
+
+    def lost(self, area: geometry.Box | Sphere | None = None) -> dict[ChunkKey, str]:
+        """Return the chunks of which something that was saved is lost, each with what; at most 64.
+
+        Their file is damaged, and in quarantine, or is gone.  Each stays in this list, also when it is mapped
+        again, until the file is back, or ``shmmap live fsck --repair`` forgets it.
+
+        Parameters
+        ----------
+        area
+            Only chunks that touch it.
+        """
+        message, since = _area(area), max(1, self.status().change)
+        page = self._ask(lambda n: messages.LiveChunks(n, self.name, message, since), messages.LiveChunkPage)
+        return _by_key(page.lacking)
 
     def _place(self) -> Place:
         opened = self._opened
@@ -271,6 +303,8 @@ class LiveMap:
         ------
         OverBudget
             There are too many voxels for the daemon's memory; request a smaller area.
+        MapDataError
+            The file of a chunk cannot be read at present, and may be good.
         """
         message = _area(area)
 
@@ -285,9 +319,12 @@ class LiveMap:
     def _listed(self, ask: Callable[[int], messages.LiveRequest]) -> Voxels:
         reply = self._ask(ask, messages.LiveVoxelsReply, quiet_s=LIST_S)
         try:
-            return _read_voxels(self._shm_dir + reply.segment, reply.count, self.resolution, reply.change)
+            path = self._shm_dir + reply.segment
+            found = _read_voxels(path, reply.count, self.resolution, reply.change)
         finally:
             self._ask(lambda n: messages.LiveRelease(n, self.name, reply.segment), messages.LiveReleased)
+        warn_of_lost_chunks(self.name, reply.lacking, reply.lacking_count)
+        return replace(found, lacking=_by_key(reply.lacking))
 
     def occupied(self, area: geometry.Box | Sphere | None = None) -> NDArray[np.float64]:
         """Return centres of the occupied voxels in memory, (N, 3) metres in the map's frame."""
@@ -355,6 +392,10 @@ class LiveMap:
                 f"a ray is {longest:.6g} m long; at most {most}", hint="cut it where the map ends"
             )
         return self._reader.first_hits(origins, ends)
+
+
+def _by_key(lacking: tuple[messages.LackingChunk, ...]) -> dict[ChunkKey, str]:
+    return {ChunkKey(*one.key): one.reason for one in lacking}
 
 
 def _points(what: str, values: ArrayLike) -> NDArray[np.float64]:

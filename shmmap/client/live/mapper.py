@@ -26,6 +26,7 @@ from shmmap.chunks.marks import encode_marks
 from shmmap.chunks.occupancy import ScanCounts, ScanFilter
 from shmmap.client.arguments import checked_seconds
 from shmmap.client.connection import SERVED_PAUSE_S, Connection, until_served
+from shmmap.client.live.problems import with_problem
 from shmmap.client.session import Session
 from shmmap.errors import (
     BadRequest,
@@ -47,6 +48,8 @@ PASSING: Final = (LiveInterrupted, Busy, DaemonUnreachable)
 """Temporary errors: sending is retried."""
 MAX_UNANSWERED: Final = 3
 """Most scans without an answer; `LiveMapper.add` waits while there are this many."""
+PROBLEM_S: Final = 1.0
+"""Time for the daemon to say why it has not answered."""
 LAST_S: Final = 1.0
 """Time for unanswered scans at the end of a program that has not closed the mapper."""
 
@@ -128,13 +131,16 @@ class _Sender:
 
     def save(self, timeout_s: float) -> int:
         """Wait until all scans are applied, and save them; return the number of the last durable scan."""
-        reply = until_served(
-            lambda: self._connection.ask(
-                messages.LiveSave(self._connection.new_request(), self._map), messages.LiveDurable,
-                timeout_s=timeout_s, quiet_s=timeout_s,
-            ),
-            timeout_s,
-        )  # fmt: skip
+        try:
+            reply = until_served(
+                lambda: self._connection.ask(
+                    messages.LiveSave(self._connection.new_request(), self._map), messages.LiveDurable,
+                    timeout_s=timeout_s, quiet_s=timeout_s,
+                ),
+                timeout_s,
+            )  # fmt: skip
+        except NoAnswer as error:
+            raise self._explained(error) from error
         # a restarted worker does not know earlier scans, which are saved all the same
         self.durable = max(reply.scan, self.applied)
         return self.durable
@@ -180,13 +186,22 @@ class _Sender:
             try:
                 return self._try(scan, max(0.1, end_s - time.monotonic()))
             except PASSING as error:  # noqa: PERF203  until it is available again
-                self.trouble = error
+                self.trouble = self._explained(error) if isinstance(error, NoAnswer) else error
                 if time.monotonic() >= end_s:
-                    raise
+                    raise self.trouble from error
                 time.sleep(SERVED_PAUSE_S)
                 with contextlib.suppress(*PASSING):
                     if not isinstance(error, Busy):
                         self.opened = self._open()
+
+    def _explained(self, error: NoAnswer) -> NoAnswer:
+        return with_problem(
+            error,
+            self._map,
+            lambda: self._connection.ask(
+                messages.LiveList(self._connection.new_request()), messages.LiveListed, timeout_s=PROBLEM_S
+            ),
+        )
 
     def _try(self, scan: _Marked, timeout_s: float) -> int:
         name = f"{self._connection.welcome.session:x}.{secrets.randbits(63)}"  # no other user can guess it

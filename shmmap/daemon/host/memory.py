@@ -16,10 +16,12 @@ from shmmap.mounts import control_groups, group_values
 from shmmap.segment.directory import ShmDirectory
 
 __all__ = [
+    "available_bytes",
     "choose_budget",
     "loader_bytes",
     "memory_limit_bytes",
     "out_of_memory_kills",
+    "room_bytes",
     "room_in_group",
 ]
 
@@ -54,6 +56,21 @@ def loader_bytes(limit_bytes: int | None) -> int:
 def room_in_group(limit_bytes: int) -> int:
     """Return how much of a control group's memory segments may take: all but half, at most 256 MiB."""
     return limit_bytes - min(limit_bytes // 2, RESERVE_BYTES)
+
+
+def available_bytes(ours_bytes: int = 0) -> int:
+    """Return a quarter of the available memory, which is the most that is used by default.
+
+    ``ours_bytes`` are those that a previous run of the daemon left in shared memory.
+    """
+    return (_memory_bytes("MemAvailable") + ours_bytes) // 4
+
+
+def room_bytes(directory: ShmDirectory, ours_bytes: int = 0, limit_bytes: int | None = None) -> int:
+    """Return the bytes of a file system that are used by default; arguments as of `choose_budget`."""
+    size, free = directory.size_bytes(), directory.free_bytes() + ours_bytes
+    group_room = room_in_group(limit_bytes) if limit_bytes is not None else LARGEST
+    return min(free - min(size // 20, RESERVE_BYTES), group_room)
 
 
 def choose_budget(
@@ -91,8 +108,6 @@ def choose_budget(
         Too little memory is free.
     """
     size, free = directory.size_bytes(), directory.free_bytes() + ours_bytes
-    group_room = room_in_group(limit_bytes) if limit_bytes is not None else LARGEST
-    room = min(free - min(size // 20, RESERVE_BYTES), group_room)
     if asked_bytes:
         if asked_bytes > size:
             raise ConfigError(
@@ -107,6 +122,7 @@ def choose_budget(
                 f" {free >> 20:,} MiB free",
                 hint="free some, lower --budget, or enlarge the tmpfs (docker: --shm-size)",
             )
+        group_room = room_in_group(limit_bytes) if limit_bytes is not None else LARGEST
         if limit_bytes is not None and asked_bytes > group_room:
             raise ConfigError(
                 f"a budget of {asked_bytes >> 20:,} MiB does not fit the control group's memory limit of"
@@ -120,8 +136,8 @@ def choose_budget(
                 f"a budget of {asked_bytes} bytes is too small", key="budget", hint="use at least 1M"
             )
         return asked_bytes
-    available_bytes = (_memory_bytes("MemAvailable") + ours_bytes) // 4
-    budget = min(available_bytes, DEFAULT_CEILING_BYTES, room - beside_bytes)
+    room = room_bytes(directory, ours_bytes, limit_bytes)
+    budget = min(available_bytes(ours_bytes), DEFAULT_CEILING_BYTES, room - beside_bytes)
     if budget < SMALLEST_BYTES:
         raise CannotStart(
             f"{directory.path} has only {free} bytes free",

@@ -17,7 +17,7 @@ from functools import partial
 from typing import Any, Final, NamedTuple, Protocol, TypeVar
 
 from shmmap.chunks.applying import UNDO_BYTES, ChunkWriter, UndoRecord
-from shmmap.chunks.chunk_file import decode_chunk, encode_chunk
+from shmmap.chunks.chunk_file import encode_chunk
 from shmmap.chunks.layout import (
     OUT_OF_SERVICE,
     ChunkIdentity,
@@ -33,7 +33,7 @@ from shmmap.daemon.live.disk.map_files import MapFiles
 from shmmap.daemon.live.paging.durability import Chunk, Scan
 from shmmap.daemon.live.paging.key_index import KeyIndex
 from shmmap.daemon.live.paging.residency import RETRY_S, Limits, Residency
-from shmmap.errors import CannotStart, MapDataError, PackageMissing, SegmentCorrupt
+from shmmap.errors import CannotStart, PackageMissing, SegmentCorrupt
 from shmmap.logfmt import log
 
 __all__ = ["FileThreads", "Job", "Observer", "PagedMap"]
@@ -288,6 +288,7 @@ class PagedMap:
         """Add a complete chunk that is in memory already."""
         key, state = chunk.view.identity.key, chunk.view.state
         self.chunks[key] = chunk
+        self.files.note_whole(key, int(state["version"]))
         # its previous writer may have died before it recorded that
         saved = state["saved_version"] = self.files.version(key)
         version, active = int(state["version"]), int(state["active"])
@@ -369,7 +370,11 @@ class PagedMap:
         self._note("hangs", "its directory does not answer: its disk is stopped or away" if hangs else "")
         if now_s >= self._look_s and not save_all:
             self._look_s = math.inf  # until this check has ended
-            self._threads.start([Job(self.files.files.moved, self._checked)])
+            self._threads.start([Job(self._look, self._checked)])
+
+    def _look(self) -> str:
+        self.files.look_again()
+        return self.files.files.moved()
 
     def _checked(self, future: Future[str], now_s: float) -> None:
         self._look_s = now_s + LOOK_S
@@ -418,9 +423,10 @@ class PagedMap:
                 known_mappers=known,
             )
         except OSError as error:  # no memory: treated as if the budget did not allow it
-            log.warning("chunk cannot grow", chunk=chunk.key.text, reason=error.strerror)
+            self._failed("enlarged", chunk.key.text, _reason(error))
             self.residency.may_grow(chunk, self.limits.budget_bytes)
             return
+        self._succeeded("enlarged")
         version, active = int(file.view.state["version"]), int(file.view.state["active"])
         self.residency.applied(chunk, scan, version=version, nbytes=file.nbytes, active=active, now_s=now_s)
         self._observer.chunk_changed(chunk.key)
@@ -436,15 +442,11 @@ class PagedMap:
     # --- files ----------------------------------------------------------------------------------
 
     def _load(self, identity: ChunkIdentity) -> ChunkFile:
-        """Load a chunk from its file, or create it; quarantine an unusable file."""
-        key = identity.key
-        content: bytes | bytearray = new_header(identity)
-        try:
-            data = self.files.load(key)
-            if data is not None:
-                content = decode_chunk(data, identity, key.text)
-        except MapDataError as error:
-            self.files.quarantine(key, error.message)
+        """Load a chunk from its file, or create it if there is no good one."""
+        content = self.files.load(identity.key, identity.generation)
+        if content is None:
+            self.files.note_remade(identity.key)
+            content = new_header(identity)
         return self.memory.create(content)
 
     def _loaded(self, chunk: Chunk, future: Future[ChunkFile], now_s: float) -> None:
@@ -461,6 +463,15 @@ class PagedMap:
         version, active = int(file.view.state["version"]), int(file.view.state["active"])
         self.residency.loaded(chunk, version=version, nbytes=file.nbytes, active=active)
         self._observer.chunk_changed(chunk.key)
+
+    def note_lost(self, key: ChunkKey, now_s: float) -> None:
+        """Note that a chunk has no good file any more; save it again if memory has all of it."""
+        if key in self.files.rows:
+            return  # saved meanwhile
+        self.stored.discard(key)
+        chunk = self.residency.chunks.get(key)
+        if key in self.chunks and chunk is not None and self.files.note_whole(key, chunk.version):
+            self.residency.save_again(chunk, now_s)
 
     def _save(self, key: ChunkKey, view: ChunkView) -> None:
         self.files.save(key, encode_chunk(view, self._codec))
@@ -481,7 +492,12 @@ class PagedMap:
     @property
     def problem(self) -> str:
         """The problem that keeps chunks from being loaded or saved at present; empty if there is none."""
-        return "; ".join(self.problems.values())
+        problems = list(self.problems.values())
+        if (unreadable := dict(self.files.unreadable)) and "loaded" not in self.problems:
+            key, reason = next(iter(unreadable.items()))
+            more = f", and {len(unreadable) - 1:,} more" if len(unreadable) > 1 else ""
+            problems.append(f"chunk {key.text} cannot be read: {reason}{more}")
+        return "; ".join(problems)
 
     def _failed(self, what: str, key: str, reason: str | None) -> None:
         if what not in self.problems:  # logged once: it is retried each second

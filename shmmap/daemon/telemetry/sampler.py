@@ -2,7 +2,8 @@
 """Periodic measurements: a few times a second, the daemon's state is written to the statistics.
 
 A beat runs in the serving loop itself, so that a daemon that hangs stops beating; it takes several turns.
-While cells are added and removed, beats are more frequent but partial: only changes are written.
+While cells are added and removed, beats are more frequent but partial: only changes are written.  While
+nothing arrives they are rare.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from shmmap.daemon.cache.holders import Survey
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.transport.sessions import Session, Sessions
+from shmmap.daemon.turns import WatchedDescriptors
 from shmmap.geometry import Area, Box, Circle
 from shmmap.protocol.rows import ClientRow, Window
 from shmmap.statistics.counters import REFUSALS, SPANS, WINDOWED
@@ -33,6 +35,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "BEAT_S",
+    "IDLE_BEAT_S",
     "PublishedGauges",
     "RecentCounts",
     "Sampler",
@@ -41,6 +44,10 @@ __all__ = [
 ]
 
 BEAT_S: Final = 0.25
+IDLE_BEAT_S: Final = 1.0
+"""Interval of beats while the daemon is idle; it counts as hung after five seconds without one."""
+IDLE_AFTER_S: Final = 2.0
+"""Time without a ready descriptor and without loads after which the daemon is idle."""
 CHANGE_BEAT_S: Final = 0.02
 EVENT_BEAT_S: Final = 1.0
 """Interval of publishing the last event's number, which reveals missed events."""
@@ -160,6 +167,8 @@ class Sampler:
 
     Parameters
     ----------
+    watched
+        Descriptors of the loop; while none gets ready, the daemon is idle.
     waiting
         Collection of the requests that wait for loads; its length is measured.
     on_beat
@@ -172,10 +181,14 @@ class Sampler:
     statistics: StatisticsWriter
     event_log: EventLog
     sessions: Sessions
+    watched: WatchedDescriptors
     waiting: Sized
     on_beat: Callable[[], None]
     _next_s: float = 0.0
     _whole_s: float = 0.0
+    _wakes: int = -1
+    _awake_s: float = 0.0  # of the last whole beat before which something had arrived
+    _idle: bool = False
     _beating: Iterator[None] | None = None
     _recent: RecentCounts = field(default_factory=lambda: RecentCounts(WINDOWED, SPANS.values()))
     _rows: SessionRows = field(default_factory=SessionRows)
@@ -188,6 +201,9 @@ class Sampler:
         """Return when the next beat, or part of one, is due: soon if cells were added, removed or changed."""
         if self._beating is not None:
             return 0.0
+        if self._idle and self.watched.wakes != self._wakes:
+            self._idle = False
+            self._next_s = self._whole_s = self._last_s + BEAT_S
         if self.statistics.outdated:
             # a reader sees a change soon, yet a stream of changes costs little
             return min(self._next_s, self._last_s + CHANGE_BEAT_S)
@@ -198,13 +214,20 @@ class Sampler:
         if self._beating is None:
             whole = now_s >= self._whole_s
             if whole:
-                self._whole_s = now_s + BEAT_S
+                self._whole_s = now_s + self._interval_s(now_s)
             self._last_s, self._next_s = now_s, self._whole_s
             self._beating = self._beat(now_s, whole=whole)
         beating, self._beating = self._beating, None
         with contextlib.suppress(StopIteration):
             next(beating)
             self._beating = beating
+
+    def _interval_s(self, now_s: float) -> float:
+        """Return the time from a whole beat to the next one."""
+        if self.watched.wakes != self._wakes or len(self.scheduler.loads) or len(self.waiting):
+            self._wakes, self._awake_s = self.watched.wakes, now_s
+        self._idle = now_s >= self._awake_s + IDLE_AFTER_S
+        return IDLE_BEAT_S if self._idle else BEAT_S
 
     def measure(self) -> None:
         """Update the gauges of memory, loads and the map."""
@@ -254,17 +277,18 @@ class Sampler:
     def _beat(self, now_s: float, *, whole: bool) -> Iterator[None]:
         """Run one beat; each step takes some tenths of a millisecond at most."""
         statistics = self.statistics
+        pause = () if self._idle else (None,)  # between steps in which there is hardly anything to do then
         if whole:
             if self.survey.idle:  # else it is run as a background task
                 self.survey.step()
             yield
             self._look_around(now_s)
-            yield
+            yield from pause
             statistics.show_clients(self._rows.of(self.sessions))
-            yield
+            yield from pause
             for _ in range(MAX_TURNS_OF_USED):
                 more = self.cache.show_used(now_s)
-                yield
+                yield from pause
                 if not more:
                     break
         for _ in range(ROWS_PER_BEAT // ROWS_PER_TURN):
@@ -274,7 +298,7 @@ class Sampler:
             yield
         yield
         self.measure()
-        yield
+        yield from pause
         statistics.beat(max_rows=0)
         if whole:
             yield

@@ -12,6 +12,7 @@ import os
 import shutil
 import stat
 import subprocess
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,10 +22,13 @@ import numpy as np
 import pytest
 
 import shmmap
-from shmmap.errors import BadRequest, CannotWrite, LiveInterrupted
+from shmmap.chunks.marking import Marker
+from shmmap.chunks.voxels import ChunkKey
+from shmmap.errors import BadRequest, Busy, CannotWrite, LiveInterrupted, NoAnswer
 from shmmap.protocol.live import LiveMapRow
 from tests.process.conftest import DaemonFactory
-from tests.support.command_line import doctor
+from tests.support.chunk_memory import ChunkMemory
+from tests.support.command_line import Shmmap, doctor, health
 from tests.support.daemon_process import Deadline
 from tests.support.disks import HangingDirectory
 from tests.support.divided_map import DividedMap
@@ -192,6 +196,107 @@ def test_each_damage_is_one_map_s_problem_until_it_is_mended(
     assert served.stop() == 0
 
 
+def damaged_body(directory: Path) -> None:
+    path = largest(directory)
+    data = bytearray(path.read_bytes())
+    data[-1] ^= 1
+    path.write_bytes(data)
+
+
+def damaged_header(directory: Path) -> None:
+    os.truncate(largest(directory), 50)
+
+
+def of_another(directory: Path) -> None:
+    path = largest(directory)
+    others = (one for one in directory.glob("*.chunk") if one != path)
+    shutil.copy(next(others), path)
+
+
+LOSSES: dict[str, Callable[[Path], object]] = {
+    "body": damaged_body, "header": damaged_header, "other": of_another,
+    "gone": lambda directory: largest(directory).unlink(), "late": damaged_body,
+    "vanished": lambda directory: largest(directory).unlink(),
+}  # fmt: skip
+WHILE_RUNNING = {"late", "vanished"}
+
+
+def test_what_is_lost_is_named_by_every_verb_and_every_reader(
+    daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path
+) -> None:
+    """No voxel is missing in silence, until the loss is forgotten on purpose."""
+    voxels = stored_drive(tmp_path / "good", 2)
+    lost = ChunkKey.from_text(largest(tmp_path / "good").name.removesuffix(".chunk"))
+    left = {voxel: value for voxel, value in voxels.items() if ChunkKey(*(i >> 6 for i in voxel)) != lost}
+    for name, damage in LOSSES.items():
+        shutil.copytree(tmp_path / "good", tmp_path / name)
+        if name not in WHILE_RUNNING:
+            damage(tmp_path / name)
+    options = ("--config", str(settings(tmp_path, "good", *LOSSES)), "--live-budget", "64M")
+    served = daemon(divided_map.root, *options)
+    shmmap_verb = Shmmap(served, tmp_path)
+
+    def all_say_so() -> None:
+        with shmmap.connect(served.endpoint, timeout=60.0) as client:
+            until_problems(client, set())
+            assert not client.live("good").lost()
+            for name in LOSSES:
+                live = client.live(name)
+                with pytest.warns(
+                    shmmap.ShmmapWarning, match=f"live map {name}: .* lost of 1 chunk:\n{lost.text}"
+                ):
+                    assert held(live, "disk") == left, name
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")
+                    for scope in ("memory", "disk", "all"):
+                        assert list(live.voxels(scope=scope).lacking) == [lost], (name, scope)
+                    assert held(live) == left, name
+                with pytest.warns(shmmap.ShmmapWarning, match=lost.text):
+                    client.live(name).log_odds([[0.0, 0.0, 0.0]])
+                assert list(live.lost()) == [lost]
+        waiting = Deadline()
+        while waiting(health(served)[1].count(lost.text) < len(LOSSES)):
+            pass
+        assert health(served)[0] == 1
+        assert "live map good" not in health(served)[1]
+        said = shmmap_verb("live", "ls")
+        assert all(f"{name}: {lost.text}" in said for name in LOSSES), said
+        finding = doctor(served)[1]["live maps"]
+        assert (finding["state"], f"{len(LOSSES)} (" in finding["fact"]) == ("warn", True), finding
+        for name in LOSSES:
+            found = shmmap_verb.json("live", "fsck", "--read-only", str(tmp_path / name), code=65)
+            assert [one["chunk"] for one in found["missing"]] == [lost.text], name
+            done = shmmap_verb.run(
+                "live", "export", str(tmp_path / name), "-o", "out.ply", "--voxels", "both", "--force"
+            )
+            assert (done.returncode, lost.text in done.stderr) == (0, True), done
+            assert f"{len(left):,} of" in done.stdout
+
+    with shmmap.connect(served.endpoint, timeout=60.0) as client:
+        until_problems(client, set())
+    for name in WHILE_RUNNING:
+        LOSSES[name](tmp_path / name)
+    with shmmap.connect(served.endpoint, timeout=60.0) as client, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for name in LOSSES:
+            client.live(name).voxels(scope="all")
+    all_say_so()
+    served.kill()
+    served.start()
+    all_say_so()
+    assert served.stop() == 0
+    for name in LOSSES:
+        shmmap_verb.json("live", "fsck", "--repair", str(tmp_path / name), code=65)
+    served.start()
+    with shmmap.connect(served.endpoint, timeout=60.0) as client, warnings.catch_warnings():
+        warnings.simplefilter("error")
+        until_problems(client, set())
+        for name in LOSSES:
+            assert held(client.live(name)) == left
+    assert health(served)[0] == 0
+    assert served.stop() == 0
+
+
 @pytest.fixture
 def hang() -> Iterator[Callable[[Path], HangingDirectory]]:
     """Have directories hang."""
@@ -292,6 +397,66 @@ def test_a_full_disk_at_the_start_and_at_the_end(
     with shmmap.connect(served.endpoint, timeout=60.0) as client:
         assert held(client.live("full")) == reference(scans)
     assert served.stop() == 0
+
+
+@pytest.mark.root
+def test_a_mapper_says_that_the_disk_is_full_and_goes_on_when_there_is_room(
+    live_daemon: LiveDaemon, tmp_path: Path, private_tmpfs: Callable[[str], str]
+) -> None:
+    """What the daemon knows is in the mapper's and the reader's error; nothing that was taken is lost."""
+    disk, scans = Path(private_tmpfs("128k")), drive(40)
+    (tmp_path / "lidar").symlink_to(disk)
+    one = live_daemon("--live-budget", "4M", resolution=0.05)
+    taken: list[int] = []
+    with shmmap.connect(one.endpoint, timeout=60.0) as client:
+        live = client.live("lidar")
+        with live.mapper("front", FILTER, timeout_s=3.0) as mapper:
+
+            def add_all() -> None:
+                for points, pose in scans[len(taken) :]:
+                    mapper.add(points, pose)
+                    taken.append(mapper.applied)
+                mapper.wait_applied()
+
+            with pytest.raises(Busy, match=r"live map lidar: a scan waits: .*No space left on device"):
+                add_all()
+            assert len(taken) > 3
+            with pytest.raises(Busy, match="No space left on device"):
+                mapper.wait_durable()
+            with (
+                shmmap.connect(one.endpoint, timeout=0.5) as hasty,
+                pytest.raises(NoAnswer, match=r"live map lidar waits: .*No space left on device"),
+            ):
+                hasty.live("lidar").save(timeout_s=0.5)
+            subprocess.run(["mount", "-o", "remount,size=64m", str(disk)], check=True)
+            waiting = Deadline()
+            while waiting(mapper.applied < len(taken)):
+                pass
+            mapper.wait_durable()
+        sent = len(taken)
+        found = {kind: len(live.voxels(kind, scope="all")) for kind in ("occupied", "free")}
+    assert one.stop() == 0
+    memory = ChunkMemory(0.05)
+    for number, (points, pose) in enumerate(scans[:sent], 1):
+        memory.apply(Marker(0.05, FILTER).mark(points, pose)[0], scan=number)
+    values = list(memory.voxels().values())
+    assert found == {
+        "occupied": sum(value > 0 for value in values),
+        "free": sum(value < 0 for value in values),
+    }
+
+
+@pytest.mark.root
+def test_live_maps_alone_get_what_is_there(
+    daemon: DaemonFactory, tmp_path: Path, private_tmpfs: Callable[[str], str]
+) -> None:
+    """Nothing is set aside for a map of points that is not served."""
+    for size in (64, 2048):
+        one = daemon("", "--config", str(settings(tmp_path, "lidar")), shm_dir=private_tmpfs(f"{size}m"))
+        with shmmap.connect(one.endpoint, timeout=60.0) as client:
+            (row,) = client.live_maps()
+        assert min(size * 0.85, 900) <= row.budget_bytes / 2**20 <= size * 0.95
+        assert one.stop() == 0
 
 
 def test_a_directory_that_is_moved_or_replaced(live_daemon: LiveDaemon, tmp_path: Path) -> None:

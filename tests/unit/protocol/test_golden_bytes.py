@@ -563,15 +563,34 @@ LIVE_REPLIES: list[tuple[Any, list[Any], str]] = [
     ),
     (
         live.LiveChunkPage(
-            6, 7, (live.LiveChunkRow((-1, 0, 2), 3, 4, "dirty", 5, 6, 7, 8),), True, ((1, 2, 3),), False
+            6,
+            7,
+            (live.LiveChunkRow((-1, 0, 2), 3, 4, "dirty", 5, 6, 7, 8),),
+            True,
+            ((1, 2, 3),),
+            False,
+            (live.LackingChunk((-1, 0, 3), "gone"),),
+            9,
         ),
-        ["live_chunk_page", 6, 7, [[[-1, 0, 2], 3, 4, "dirty", 5, 6, 7, 8]], True, [[1, 2, 3]], False],
-        ("97af6c6976655f6368756e6b5f706167650607919893ff00020304a5646972747905060708c39193010203c2"),
+        [
+            "live_chunk_page",
+            6,
+            7,
+            [[[-1, 0, 2], 3, 4, "dirty", 5, 6, 7, 8]],
+            True,
+            [[1, 2, 3]],
+            False,
+            [[[-1, 0, 3], "gone"]],
+            9,
+        ],
+        (
+            "99af6c6976655f6368756e6b5f706167650607919893ff00020304a5646972747905060708c39193010203c2919293ff0003a4676f6e6509"
+        ),
     ),
     (
-        live.LiveVoxelsReply(7, 8, "/s", 9, 126),
-        ["live_voxels_reply", 7, 8, "/s", 9, 126],
-        "96b16c6976655f766f78656c735f7265706c790708a22f73097e",
+        live.LiveVoxelsReply(7, 8, "/s", 9, 126, (live.LackingChunk((-1, 0, 3), "gone"),), 2),
+        ["live_voxels_reply", 7, 8, "/s", 9, 126, [[[-1, 0, 3], "gone"]], 2],
+        "98b16c6976655f766f78656c735f7265706c790708a22f73097e919293ff0003a4676f6e6502",
     ),
     (
         live.LiveReleased(8),

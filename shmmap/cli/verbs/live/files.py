@@ -248,6 +248,13 @@ def _run_export(args: argparse.Namespace) -> int:
         print_pairs([*_export_lines(made), ("time", format_duration(seconds))])
     if made.quarantined:
         complain("shmmap", f"left out: {counted(len(made.quarantined), 'damaged file')} in quarantine")
+    if made.missing:
+        named = ", ".join(made.missing[:3]) + (", ..." if len(made.missing) > 3 else "")
+        complain(
+            "shmmap",
+            f"left out: what is lost of {counted(len(made.missing), 'chunk')}: {named}",
+            "`shmmap live fsck` says what is missing",
+        )
     return 0
 
 

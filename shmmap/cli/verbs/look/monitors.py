@@ -25,7 +25,11 @@ _HEALTH_EXIT = """\
 Exit code: 0 healthy, 1 starting, unreachable, paused or hung, 69 dead or never started; with --strict
 also 1 while clients lack something: cells were refused in the last minute, the map's files are out of
 reach, the map could not be read again or has problems, its signature has expired, the version that its origin
-offers is refused, or a live map has a problem."""
+offers is refused, or a live map has a problem, a damaged file or a missing chunk."""
+
+
+_NAMED = 3
+"""Damaged files that are named, at most."""
 
 
 def add_health(subparsers: Subparsers) -> None:
@@ -84,6 +88,12 @@ def _troubles(found: Snapshot) -> list[str]:
         (sum(bool(row.problem) for row in found.live), "live maps with a problem (`shmmap live ls`)"),
     )
     troubles = [f"{count:,} {text}" for count, text in counted_troubles if count]
+    troubles += [
+        f"live map {row.name}: {row.damaged_count:,} damaged files or missing chunks: "
+        + ("; ".join(row.damaged[:_NAMED]) or "`shmmap live ls` names them")
+        for row in found.live
+        if row.damaged_count
+    ]
     if counts.get("origin_out", 0):
         troubles.append("no load succeeds: the map's files are out of reach (`shmmap doctor`)")
     troubles += trust_problems(counts, time.time())

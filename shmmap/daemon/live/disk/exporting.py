@@ -20,16 +20,18 @@ from shmmap.chunks.chunk_file import ChunkFileHeader
 from shmmap.chunks.layout import ChunkView
 from shmmap.chunks.occupancy import UNIT
 from shmmap.chunks.voxels import ChunkKey, voxel_centers, voxels_of
+from shmmap.daemon.live.disk.map_record import MANIFEST, Row
 from shmmap.daemon.live.disk.stored_map import StoredMap
 from shmmap.dividing.divide import divide
 from shmmap.dividing.frame import Frame, Translation, frame_between
 from shmmap.dividing.inputs import check_output_directory
 from shmmap.dividing.lattice import CellLattice
 from shmmap.dividing.settings import DivideSettings
-from shmmap.errors import BadRequest
+from shmmap.errors import BadRequest, MapDataError
 from shmmap.formats.durable_file import appearing_file, writing_errors
 from shmmap.formats.pcd.writer import pcd_header
 from shmmap.formats.ply_header import ply_header
+from shmmap.quantities import counted
 
 __all__ = ["ExportedVoxels", "Format", "Voxels", "export"]
 
@@ -56,7 +58,9 @@ class ExportedVoxels(msgspec.Struct, frozen=True):
     fields
         Names and dtypes of the columns.
     quarantined
-        Number of files left out because they were quarantined before.
+        Files left out because they were quarantined before.
+    missing
+        Chunks of which something that was saved is lost.
     """
 
     path: str
@@ -69,6 +73,7 @@ class ExportedVoxels(msgspec.Struct, frozen=True):
     origin: tuple[float, float, float]
     fields: list[tuple[str, str]]
     quarantined: list[str]
+    missing: list[str]
 
 
 def export(
@@ -101,7 +106,7 @@ def export(
     BadRequest
         ``out`` exists, or a setting is invalid.
     MapDataError
-        A chunk's file is damaged.
+        A chunk's file or the manifest is damaged; or there are no voxels, and something is lost.
     CannotWrite
         The disk is full or not writable.
     """
@@ -111,7 +116,15 @@ def export(
         check_output_directory(path, force=force)
     elif os.path.isdir(path) or (os.path.lexists(path) and not force):
         raise BadRequest(f"{path} exists", hint="give another name, or --force to overwrite a file")
-    keys = _keys(stored, voxels)
+    headers = {key: stored.header(key) for key in stored.chunks}
+    keys = _keys(headers, voxels)
+    missing = _missing(stored, headers)
+    if not keys and missing:
+        raise MapDataError(
+            f"no {voxels} voxel is left, and something is lost of {counted(len(missing), 'chunk')}",
+            path=stored.path,
+            hint="`shmmap live fsck` names what is missing",
+        )
     if not keys:
         return None
     frame = frame_between(
@@ -146,13 +159,27 @@ def export(
         origin=origin,
         fields=fields,
         quarantined=stored.names.quarantined,
+        missing=missing,
     )
 
 
 # --- which voxels -----------------------------------------------------------------------------------
 
 
-def _keys(stored: StoredMap, voxels: Voxels) -> list[ChunkKey]:
+def _missing(stored: StoredMap, headers: dict[ChunkKey, ChunkFileHeader]) -> list[str]:
+    """Return the chunks of which something that was saved is lost."""
+    if stored.manifest_error:
+        raise MapDataError(
+            f"it cannot be seen whether chunks are missing: {stored.manifest_error}",
+            path=os.path.join(stored.path, MANIFEST),
+            hint="a daemon writes it again, and so does `shmmap live fsck --repair`",
+        )
+    rows = {key: Row.of(header) for key, header in headers.items()}
+    lost = stored.listed.lost(rows) if stored.listed is not None else {}
+    return [key.text for key in lost]
+
+
+def _keys(headers: dict[ChunkKey, ChunkFileHeader], voxels: Voxels) -> list[ChunkKey]:
     """Return the chunks that contain such voxels, according to their files' headers."""
 
     def has_some(header: ChunkFileHeader) -> bool:
@@ -163,7 +190,7 @@ def _keys(stored: StoredMap, voxels: Voxels) -> list[ChunkKey]:
         }
         return counted[voxels] > 0
 
-    return [key for key in stored.chunks if has_some(stored.header(key))]
+    return [key for key, header in headers.items() if has_some(header)]
 
 
 def _bounds(keys: list[ChunkKey], resolution: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -16,9 +16,9 @@ from shmmap.daemon.live.disk.map_record import (
     MANIFEST,
     MAP_FILE,
     FileNames,
+    Listed,
     Row,
     read_header,
-    read_manifest,
     write_rows,
 )
 from shmmap.daemon.live.disk.stored_map import StoredMap
@@ -66,7 +66,8 @@ class CheckedMap(msgspec.Struct):
         Files that this process may not read, or that are not regular, with the reason: they may be undamaged.
         `repair` quarantines them, too.
     missing
-        Chunks or versions in the manifest for which there is no file.
+        Chunks of which something is lost: the manifest lists a version for which there is no file, or that a
+        daemon lost, whatever was mapped there since.
     manifest
         ``stale`` if its list of chunks differs from the files, as after a daemon was killed.
     interim
@@ -113,8 +114,8 @@ def check(files: FolderToRead, path: str) -> CheckedMap:
     PackageMissing
         A chunk is compressed by a package that is not installed.
     """
-    listed = _listed(files)  # before the files, since files only get newer
     stored = StoredMap(files, path)
+    listed = stored.listed
     rows: dict[ChunkKey, Row] = {}
     damaged: list[DamagedFile] = []
     unreadable: dict[str, str] = {}
@@ -144,8 +145,14 @@ def check(files: FolderToRead, path: str) -> CheckedMap:
         rows=rows,
         damaged=damaged,
         unreadable=unreadable,
-        missing=_missing(listed, rows, known) if isinstance(listed, dict) else [],
-        manifest=("current" if listed == rows else "stale") if isinstance(listed, dict) else listed,
+        missing=_missing(listed.lost(rows), rows, known) if listed is not None else [],
+        manifest=(
+            ("current" if listed.chunks == rows else "stale")
+            if listed is not None
+            else "unreadable"
+            if stored.manifest_error
+            else "absent"
+        ),
         interim=interim,
         quarantined=stored.names.quarantined,
         strange=stored.names.strange,
@@ -169,22 +176,11 @@ def _row_or_error(stored: StoredMap, key: ChunkKey) -> Row | MapDataError:
     return Row.of(header)
 
 
-def _listed(files: FolderToRead) -> dict[ChunkKey, Row] | Literal["absent", "unreadable"]:
-    """Return the chunks that the manifest lists."""
-    try:
-        return read_manifest(files)[0]
-    except FileNotFoundError:
-        return "absent"
-    except (OSError, MapDataError):
-        return "unreadable"
-
-
-def _missing(listed: dict[ChunkKey, Row], rows: dict[ChunkKey, Row], known: set[str]) -> list[MissingChunk]:
-    found = {key: rows[key].version if key in rows else 0 for key in listed}
+def _missing(lost: dict[ChunkKey, Row], rows: dict[ChunkKey, Row], known: set[str]) -> list[MissingChunk]:
     return [
-        MissingChunk(key.text, row.version, found[key])
-        for key, row in listed.items()
-        if row.version > found[key] and key.text + CHUNK not in known
+        MissingChunk(key.text, row.version, rows[key].version if key in rows else 0)
+        for key, row in lost.items()
+        if key.text + CHUNK not in known
     ]
 
 
@@ -205,8 +201,9 @@ def repair(files: Folder, found: CheckedMap) -> None:
         found.damaged.append(DamagedFile(MANIFEST, "it cannot be read, or does not list chunks"))
     for one in found.damaged:
         one.kept_as = quarantine(files, one.file)
-    if found.manifest != "current":
-        write_rows(files, found.rows, {})  # a program that replays its scans restores the damaged chunks
+    if found.manifest != "current" or found.missing:
+        # a program that replays its scans restores the damaged chunks
+        write_rows(files, Listed(found.rows, {}, {}))
         found.rewritten = True
 
 

@@ -8,20 +8,30 @@
   disk fails, and for the next load: a file that is written often is flushed seldom.
 - ``manifest.json`` lists the durable chunks.  It is written last, and only serves to detect chunks removed
   since; all other data is read from the chunks' headers.
-- A damaged file is quarantined as ``3_-1_0.chunk.damaged.1``, reported, and never overwritten.  A file that
-  the system does not let this process read may be good: then the map cannot be opened, and nothing changes.
+- A damaged file is quarantined as ``3_-1_0.chunk.damaged.1``, reported, and never overwritten, and its chunk
+  is `missing`, as one is whose file is gone.  All who need a saved chunk read it by `MapFiles.load`, so
+  whichever of them finds that, all know.  A file that the system does not let this process read may be good:
+  at the start the map is then not opened, later the chunk is `unreadable` until it can be read.
 """
 
 from __future__ import annotations
 
 import contextlib
 import secrets
+import threading
 from collections.abc import Iterator
+from itertools import chain, islice
 from typing import Final
 
 import msgspec
 
-from shmmap.chunks.chunk_file import FILE_HEADER_BYTES, ChunkFileHeader, check_file, read_file_header
+from shmmap.chunks.chunk_file import (
+    FILE_HEADER_BYTES,
+    ChunkFileHeader,
+    check_file,
+    decode_chunk,
+    read_file_header,
+)
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.daemon.live.disk.folder import Folder, quarantine, replace_file
 from shmmap.daemon.live.disk.map_record import (
@@ -30,6 +40,7 @@ from shmmap.daemon.live.disk.map_record import (
     MAP_FILE,
     MAP_FORMAT,
     FileNames,
+    Listed,
     Mapper,
     MapRecord,
     MapSettings,
@@ -45,8 +56,9 @@ from shmmap.errors import ConfigError, MapDataError
 from shmmap.failpoints import step
 from shmmap.logfmt import log
 
-__all__ = ["MapFiles"]
+__all__ = ["MapFiles", "loss_text"]
 
+_UNKNOWN: Final = Row(0, 0, 0, 0, 0, 0)
 SCANS_AHEAD: Final = 1 << 20
 """Scan numbers that ``map.json`` reserves for a mapper at a time: those of a day at 10 Hz."""
 
@@ -68,7 +80,13 @@ class MapFiles:
     damaged : dict
         Files that were quarantined since the start, and why.
     missing : dict
-        Chunks that were durable and are gone, or exist only in an older version.
+        Chunks of which something that was saved is lost, as they were: the file was quarantined, is gone, or
+        is an older one.  They stay here, and in the manifest, when the chunk is mapped again, until the same
+        file is back or ``shmmap live fsck --repair`` forgets them.
+    unreadable : dict
+        Chunks whose files the system does not let this process read at present, and why.
+    manifest_is_due : bool
+        Whether `missing` has changed since the manifest was last written.
     applied : dict
         For each mapper's number, the last scan up to which all are durable, according to the manifest.
 
@@ -87,6 +105,11 @@ class MapFiles:
         self.rows: dict[ChunkKey, Row] = {}
         self.damaged: dict[str, str] = {}
         self.missing: dict[ChunkKey, Row] = {}
+        self.unreadable: dict[ChunkKey, str] = {}
+        self.manifest_is_due = False
+        self._quarantined: set[ChunkKey] = set()
+        self._remade: set[ChunkKey] = set()  # missing chunks that memory may have again, without what is lost
+        self._changing = threading.Lock()
         self._unflushed = UnflushedFiles(files)
         self.applied: dict[int, int] = {}
         self._durable: dict[ChunkKey, Row] = {}
@@ -186,19 +209,99 @@ class MapFiles:
         row = self.rows.get(key)
         return row.version if row is not None else 0
 
-    def load(self, key: ChunkKey) -> bytes | None:
-        """Return the content of a chunk's file; None if there is none.  Raise OSError or MapDataError."""
+    def load(self, key: ChunkKey, generation: int = 0) -> bytearray | None:
+        """Return a chunk as it was last saved, with a generation; None if there is no good file.
+
+        A damaged file is quarantined, one that is gone noted: from then on the chunk is `missing`.
+
+        Raises
+        ------
+        OSError
+            The file cannot be read at present, and may be good: the chunk is `unreadable` until it can.
+        PackageMissing
+            The package for its codec is not installed.
+        """
+        try:
+            found = self._load(key, generation)
+        except OSError as error:
+            self.unreadable[key] = error.strerror or str(error)
+            raise
+        self.unreadable.pop(key, None)
+        return found
+
+    def _load(self, key: ChunkKey, generation: int) -> bytearray | None:
+        with contextlib.suppress(FileNotFoundError, MapDataError):
+            return self._read(key, generation)
+        with self._unflushed.flushing:  # read again while no other file gets its name
+            if (row := self.rows.get(key)) is None:
+                return None  # another thread was here
+            try:
+                return self._read(key, generation)
+            except FileNotFoundError:
+                self._lose(key, row, "its file is gone")
+            except MapDataError as error:
+                why = error.message.removeprefix(f"{key.text}: ")
+                self._quarantine(key.text + CHUNK, why)
+                self._quarantined.add(key)
+                self._lose(key, row, why)
+        return None
+
+    def _read(self, key: ChunkKey, generation: int) -> bytearray | None:
         if key not in self.rows:
             return None
-        unflushed = self._unflushed.get(key)
-        return unflushed if unflushed is not None else read_chunk(self.files, key.text + CHUNK)
+        data = self._unflushed.get(key)
+        if data is None:
+            data = read_chunk(self.files, key.text + CHUNK)
+        return decode_chunk(data, self.settings.identity(self.map_id, key, generation), key.text)
+
+    def look_again(self) -> None:
+        """Try to read chunks that were unreadable."""
+        for key in list(self.unreadable):
+            with contextlib.suppress(OSError):
+                self.load(key)
 
     def quarantine(self, key: ChunkKey, why: str) -> str:
         """Rename a chunk's unusable file to a quarantine name; return that name."""
         name = self._quarantine(key.text + CHUNK, why)
-        self.rows.pop(key, None)
-        self._durable.pop(key, None)
+        self._quarantined.add(key)
+        self._lose(key, self.rows.get(key), why)
         return name
+
+    def _lose(self, key: ChunkKey, row: Row | None, why: str) -> None:
+        """Note that a chunk's file, which had this row (None: not known), is of no use any more."""
+        with self._changing:
+            if self.rows.get(key) is not row:
+                return  # saved meanwhile
+            self.rows.pop(key, None)
+            self._durable.pop(key, None)
+            self.missing.setdefault(key, row or _UNKNOWN)
+            self.manifest_is_due = True
+        log.error("chunk missing", chunk=key.text, version=row.version if row else None, reason=why)
+
+    def note_remade(self, key: ChunkKey) -> None:
+        """Note that a chunk is in memory without what its file had, if that is lost."""
+        if key in self.missing:
+            self._remade.add(key)
+
+    def note_whole(self, key: ChunkKey, version: int) -> bool:
+        """Return whether a chunk in memory, of this version, has all that is lost on disk; note that."""
+        row = self.missing.get(key)
+        if row is None or key in self._remade or version < row.version:
+            return False
+        del self.missing[key]
+        self.manifest_is_due = True
+        log.info("chunk is whole in memory, and saved again", chunk=key.text)
+        return True
+
+    def losses(self, most: int) -> tuple[tuple[str, ...], int]:
+        """Return texts about quarantined files and other chunks that lost something; and their number."""
+        quarantined, missing = dict(self.damaged), dict(self.missing)  # other threads find more
+        others = missing.keys() - self._quarantined
+        texts = chain(
+            (f"{key.text}: {loss_text(missing[key])}" for key in others),
+            (f"{name}: {why}" for name, why in quarantined.items()),
+        )
+        return tuple(islice(texts, most)), len(others) + len(quarantined)
 
     def _quarantine(self, name: str, why: str) -> str:
         other = quarantine(self.files, name)
@@ -213,7 +316,9 @@ class MapFiles:
         """
         row = Row.of(read_file_header(data))
         self._unflushed.write(key, data)
-        self.rows[key] = row
+        with self._changing:
+            self.rows[key] = row
+        self.unreadable.pop(key, None)
 
     def flush(self) -> None:
         """Make all saved chunks durable; chunks saved meanwhile are left to the next flush."""
@@ -237,7 +342,8 @@ class MapFiles:
         self.flush()
         if applied is not None:
             self.applied = applied
-        write_rows(self.files, dict(self._durable), self.applied)
+        self.manifest_is_due = False
+        write_rows(self.files, Listed(dict(self._durable), self.applied, dict(self.missing)))
 
     # --- the start ------------------------------------------------------------------------------
 
@@ -266,6 +372,8 @@ class MapFiles:
                         self.files.sync(name)
                         self.files.rename(name, place)
                         continue
+                elif CHUNK in name and self.files.size(name):
+                    log.warning("unfinished file of a live map removed", file=name, reason="it is damaged")
                 self.files.remove(name)
 
     def _read_rows(self) -> None:
@@ -286,16 +394,23 @@ class MapFiles:
             return
         try:
             with _named(MANIFEST):
-                listed, applied = read_manifest(self.files)
+                listed = read_manifest(self.files)
         except MapDataError as error:
             self._quarantine(MANIFEST, error.message)  # it is written again
             return
         sent = {mapper.number: mapper.scans for mapper in self.mappers}
-        self.applied = {number: scan for number, scan in applied.items() if scan < sent.get(number, 0)}
-        for key, row in listed.items():
-            if key not in self.rows or self.rows[key].version < row.version:
-                self.missing[key] = row
+        self.applied = {number: scan for number, scan in listed.applied.items() if scan < sent.get(number, 0)}
+        lost = listed.lost(self.rows)
+        self._remade = listed.missing.keys() & lost.keys()
+        for key, row in lost.items():
+            if key not in self.missing:
                 log.error("chunk missing", chunk=key.text, version=row.version)
+        self.missing |= lost
+
+
+def loss_text(row: Row) -> str:
+    """Return what is lost of a chunk that had this row."""
+    return f"version {row.version} is missing" if row.version else "what its file had is missing"
 
 
 @contextlib.contextmanager

@@ -28,6 +28,7 @@ __all__ = [
     "MAP_FILE",
     "MAP_FORMAT",
     "FileNames",
+    "Listed",
     "Manifest",
     "MapRecord",
     "MapSettings",
@@ -149,11 +150,14 @@ class Manifest(msgspec.Struct):
         The durable chunks.
     applied
         For each mapper's number, the last scan up to which at least all are durable.
+    missing
+        Chunks of which something was lost, as they were listed: a file was quarantined, or is gone.
     """
 
     format: int
     chunks: dict[str, Row]
     applied: dict[int, Count] = {}
+    missing: dict[str, Row] = {}
 
 
 class FileNames(NamedTuple):
@@ -269,8 +273,23 @@ def read_map(files: FolderToRead) -> MapRecord:
     return found
 
 
-def read_manifest(files: FolderToRead) -> tuple[dict[ChunkKey, Row], dict[int, int]]:
-    """Return the chunks in the manifest, and for each mapper the last scan up to which all are durable.
+class Listed(NamedTuple):
+    """What the manifest lists; attributes as in `Manifest`."""
+
+    chunks: dict[ChunkKey, Row]
+    applied: dict[int, int]
+    missing: dict[ChunkKey, Row]
+
+    def lost(self, rows: Mapping[ChunkKey, Row]) -> dict[ChunkKey, Row]:
+        """Return, of what was listed, the chunks of which these rows of good files lack something."""
+        found = {
+            key: row for key, row in self.chunks.items() if key not in rows or rows[key].version < row.version
+        }
+        return {**found, **{key: row for key, row in self.missing.items() if rows.get(key) != row}}
+
+
+def read_manifest(files: FolderToRead) -> Listed:
+    """Read ``manifest.json``.
 
     Raises
     ------
@@ -283,13 +302,19 @@ def read_manifest(files: FolderToRead) -> tuple[dict[ChunkKey, Row], dict[int, i
     if found.format != MAP_FORMAT:
         raise MapDataError(f"format {found.format}; this reads {MAP_FORMAT}", path=MANIFEST)
     try:
-        return {ChunkKey.from_text(text): row for text, row in found.chunks.items()}, found.applied
+        chunks, missing = (
+            {ChunkKey.from_text(text): row for text, row in rows.items()}
+            for rows in (found.chunks, found.missing)
+        )
     except BadRequest as error:
         raise MapDataError(f"it is damaged: {error.message}", path=MANIFEST) from error
+    return Listed(chunks, found.applied, missing)
 
 
-def write_rows(files: Folder, rows: Mapping[ChunkKey, Row], applied: dict[int, int]) -> None:
-    """Write the manifest: these chunks, and all scans of mappers up to these, are durable."""
-    listed = Manifest(MAP_FORMAT, {key.text: row for key, row in rows.items()}, applied)
-    replace_file(files, MANIFEST, msgspec.json.encode(listed))
+def write_rows(files: Folder, listed: Listed) -> None:
+    """Write the manifest."""
+    chunks, missing = (
+        {key.text: row for key, row in rows.items()} for rows in (listed.chunks, listed.missing)
+    )
+    replace_file(files, MANIFEST, msgspec.json.encode(Manifest(MAP_FORMAT, chunks, listed.applied, missing)))
     files.sync_names()

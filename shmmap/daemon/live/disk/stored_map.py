@@ -10,11 +10,20 @@ import contextlib
 import os
 from collections.abc import Iterator
 
-from shmmap.chunks.chunk_file import ChunkFileHeader, decode_chunk, read_file_header
+from shmmap.chunks.chunk_file import ChunkFileHeader, check_identity, decode_chunk, read_file_header
 from shmmap.chunks.layout import ChunkView
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.daemon.live.disk.folder import Folder, FolderToRead
-from shmmap.daemon.live.disk.map_record import CHUNK, MAP_FILE, FileNames, read_chunk, read_header, read_map
+from shmmap.daemon.live.disk.map_record import (
+    CHUNK,
+    MAP_FILE,
+    FileNames,
+    Listed,
+    read_chunk,
+    read_header,
+    read_manifest,
+    read_map,
+)
 from shmmap.errors import InstanceBusy, MapDataError, MapMissing
 
 __all__ = ["StoredMap", "opened_folder", "opened_folder_to_read"]
@@ -32,6 +41,8 @@ class StoredMap:
     ----------
     map_id, settings
         As in ``map.json``.
+    listed
+        What the manifest lists; None without one, or if it is damaged (`manifest_error`).
     names, chunks
         All files of the directory, and among them those of chunks, by key.
 
@@ -57,6 +68,14 @@ class StoredMap:
             ) from error
         self.map_id = bytes.fromhex(record.map_id)
         self.settings = record.settings
+        self.listed: Listed | None = None
+        self.manifest_error = ""
+        try:  # before the files, since files only get newer
+            self.listed = read_manifest(files)
+        except FileNotFoundError:
+            pass
+        except (OSError, MapDataError) as error:
+            self.manifest_error = (error.strerror or "") if isinstance(error, OSError) else error.message
         self.names = FileNames.of(files.names())
         self.chunks = self.names.chunks
 
@@ -64,7 +83,9 @@ class StoredMap:
         """Return the header of a chunk's file; raise as `chunk`."""
         path = self.path_of(key)
         with _reading(path):
-            return read_header(self.files, self.chunks[key], path)
+            header = read_header(self.files, self.chunks[key], path)
+            check_identity(header, self.settings.identity(self.map_id, key, 0), path)
+            return header
 
     def chunk(self, key: ChunkKey) -> tuple[ChunkFileHeader, ChunkView]:
         """Read a whole chunk and verify that it is as saved.

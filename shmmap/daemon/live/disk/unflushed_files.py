@@ -47,6 +47,8 @@ class UnflushedFiles:
     ----------
     nbytes : int
         Memory of the files in this process.
+    flushing : threading.Lock
+        Held while files get their final names.
     """
 
     def __init__(self, files: Folder) -> None:
@@ -54,7 +56,7 @@ class UnflushedFiles:
         self.nbytes = 0
         self._written: dict[ChunkKey, _Written] = {}
         self._spare: list[str] = []
-        self._changing, self._flushing = threading.Lock(), threading.Lock()
+        self._changing, self.flushing = threading.Lock(), threading.Lock()
 
     def get(self, key: ChunkKey) -> bytes | None:
         """Return the newest content of a chunk's file; None if the newest file has its final name."""
@@ -112,7 +114,7 @@ class UnflushedFiles:
         OSError
             Some files are not on disk; the next flush writes all of them again.
         """
-        with self._flushing:  # a second caller waits until the files are durable
+        with self.flushing:  # a second caller waits until the files are durable
             with self._changing:
                 taken = dict(self._written)
                 for one in taken.values():

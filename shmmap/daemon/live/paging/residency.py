@@ -510,6 +510,12 @@ class Residency:
         chunk.retry_s = self._save_s = now_s + RETRY_S  # others would fail as well
         self._soil(chunk, now_s)
 
+    def save_again(self, chunk: Chunk, now_s: float) -> None:
+        """Have a chunk in memory saved, whose file is lost."""
+        chunk.saved = chunk.durable = 0
+        if chunk.state is State.CLEAN:
+            self._soil(chunk, now_s)
+
     @property
     def dirty(self) -> int:
         """Number of chunks that are changed and neither saved nor being saved."""

@@ -24,6 +24,7 @@ from shmmap.daemon.live.messages import Ask
 from shmmap.daemon.live.paged_map import FileThreads, Job, PagedMap
 from shmmap.daemon.live.paging.key_index import KeyIndex, merged_part
 from shmmap.daemon.live.worker.areas import check_area, key_range, touches
+from shmmap.daemon.live.worker.lacking import lacking_chunks, shown
 from shmmap.daemon.live.worker.voxel_lists import Later, Steps, VoxelLists
 from shmmap.errors import BadRequest, CannotWrite, InternalError, ShmmapError
 from shmmap.logfmt import log
@@ -331,8 +332,11 @@ class Readers:
                 break
             yield None
         page = tuple(rows[: messages.MAX_CHUNK_ROWS])
+        lacking = {}
+        if message.after is None:
+            lacking = yield from lacking_chunks(live, area)
         return messages.LiveChunkPage(
-            message.request, change, page, len(rows) > len(page), tuple(gone), known
+            message.request, change, page, len(rows) > len(page), tuple(gone), known, *shown(lacking)
         )
 
     def _row(self, key: ChunkKey) -> messages.LiveChunkRow | None:

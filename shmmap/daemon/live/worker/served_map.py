@@ -10,7 +10,6 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
-from itertools import chain, islice
 from typing import Final, Protocol, TypeVar
 
 import msgspec
@@ -28,7 +27,7 @@ from shmmap.daemon.live.paging.windows import place_ahead
 from shmmap.daemon.live.worker.mappers import APPLIED_BYTES, ActiveMapper, AppliedScans, Mappers
 from shmmap.daemon.live.worker.marks_directory import MAX_MARKS_BYTES, MarksDirectory
 from shmmap.daemon.live.worker.readers import Changes, Readers
-from shmmap.errors import BadRequest, CannotWrite, InternalError, NotPermitted, ShmmapError
+from shmmap.errors import BadRequest, Busy, CannotWrite, InternalError, NotPermitted, ShmmapError
 from shmmap.logfmt import log
 from shmmap.protocol import live as messages
 from shmmap.protocol.messages import ErrorReply
@@ -43,6 +42,10 @@ MAX_AHEAD_CHUNKS: Final = 4.0
 MARKS_PART: Final = 2
 """Divisor of the budget for the marks of one scan, which are in shared memory until they are accepted."""
 MANIFEST_S: Final = 60.0
+SAY_WHY_S: Final = 1.0
+"""After this time a scan that waits because of a problem is answered with the problem."""
+MAX_LOSSES: Final = 64
+"""Most damaged files and missing chunks that are named; all are counted."""
 FILES_S: Final = 0.5
 """Interval at which the sizes of files are summed."""
 
@@ -57,6 +60,15 @@ class _Place:
 
     xyz: tuple[float, float, float]
     seen_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Ticket:
+    """A request to apply a scan, and the time at which it came."""
+
+    number: int
+    request: int
+    since_s: float
 
 
 class ServedMap:
@@ -94,8 +106,8 @@ class ServedMap:
         self.readers = Readers(self.live, self.changes, answer, wake)
         self._marks = marks
         self._answer = answer
-        self._tickets: dict[tuple[int, int], list[tuple[int, int]]] = {}  # of scans not applied yet
-        self._waiting: deque[tuple[Ask, messages.LiveScan]] = deque()
+        self._tickets: dict[tuple[int, int], list[_Ticket]] = {}  # of scans accepted and not applied yet
+        self._waiting: deque[tuple[_Ticket, Ask, messages.LiveScan]] = deque()
         self._saves: list[tuple[Ask, messages.LiveSave, list[tuple[Chunk, int]]]] = []
         self._places: dict[int, _Place] = {}
         self._writing: dict[int, int] = {}  # sessions by ticket whose requests wait for the disk
@@ -201,40 +213,61 @@ class ServedMap:
         active = expect()
         self._move(ask.session, message.sensor, now_s)
         tickets = self._tickets.get((active.mapper.number, message.scan))
+        ticket = _Ticket(ask.ticket, message.request, now_s)
         if tickets is not None:
-            self._add_ticket(tickets, ask, message)
+            self._add_ticket(tickets, ticket)
         else:
-            self._waiting.append((ask, message))
+            self._waiting.append((ticket, ask, message))
 
     @staticmethod
-    def _add_ticket(tickets: list[tuple[int, int]], ask: Ask, message: messages.LiveScan) -> None:
-        tickets.append((ask.ticket, message.request))
+    def _add_ticket(tickets: list[_Ticket], ticket: _Ticket) -> None:
+        tickets.append(ticket)
         del tickets[:-MAX_PER_SESSION]  # older tickets belong to sessions that have ended
+
+    def _say_why(self, now_s: float) -> None:
+        """Refuse scans that wait because of a problem: their mappers send them again, and they count once.
+
+        Scans that are accepted are applied all the same.
+        """
+        if not (problem := self.live.problem):
+            return
+        before_s = now_s - SAY_WHY_S
+        late = [ticket for ticket, _, _ in self._waiting if ticket.since_s <= before_s]
+        self._waiting = deque(row for row in self._waiting if row[0].since_s > before_s)
+        for tickets in self._tickets.values():
+            late += [one for one in tickets if one.since_s <= before_s]
+            tickets[:] = [one for one in tickets if one.since_s > before_s]
+        text = f"live map {self.settings.name}: a scan waits: {problem}"
+        for one in late:
+            reply = ErrorReply(
+                one.request, Busy.code, text, "it is applied when that is mended; it counts once"
+            )
+            self._answer(one.number, reply)
 
     def _accept_scans(self) -> None:
         """Accept waiting scans while there is memory; the others stay in the directory of marks."""
-        while self._waiting and self.live.residency.has_room(self._waiting[0][1].bytes):
-            ask, message = self._waiting.popleft()
+        while self._waiting and self.live.residency.has_room(self._waiting[0][2].bytes):
+            ticket, ask, message = self._waiting.popleft()
             try:
-                self._accept(ask, message)
+                self._accept(ticket, ask, message)
             except ShmmapError as error:
                 self._refuse(ask, message.request, error)
             except Exception:  # noqa: BLE001  a defect with one file must not end the map for all
                 log.exception("marks cannot be read")
                 self._refuse(ask, message.request, InternalError("the daemon failed on these marks"))
 
-    def _accept(self, ask: Ask, message: messages.LiveScan) -> None:
+    def _accept(self, ticket: _Ticket, ask: Ask, message: messages.LiveScan) -> None:
         active = self.mappers.by_number.get(message.mapper)
         if active is None or active.session != ask.session:
             raise BadRequest(f"the session does not map as mapper {message.mapper} any more")
         tickets = self._tickets.get((message.mapper, message.scan))
         if tickets is not None:
-            self._add_ticket(tickets, ask, message)
+            self._add_ticket(tickets, ticket)
             return
         data = self._marks.take(message.marks, message.bytes, ask.session, ask.uid)
         marks = decode_marks(data, self.live.files.map_id, message.mapper, message.scan)
         self.mappers.accepted(active, message.scan)
-        self._tickets[message.mapper, message.scan] = [(ask.ticket, message.request)]
+        self._tickets[message.mapper, message.scan] = [ticket]
         self.live.add(message.mapper, message.scan, marks, message.bytes)
 
     def _move(self, session: int, position: tuple[float, float, float], now_s: float) -> None:
@@ -259,7 +292,7 @@ class ServedMap:
         self._writing = {ticket: one for ticket, one in self._writing.items() if one != session}
         self.mappers.on_disconnect(session)
         self.readers.on_disconnect(session)
-        self._waiting = deque(row for row in self._waiting if row[0].session != session)
+        self._waiting = deque(row for row in self._waiting if row[1].session != session)
         self._saves = [row for row in self._saves if row[0].session != session]
 
     # --- changes of the map ----------------------------------------------------------------
@@ -280,8 +313,8 @@ class ServedMap:
         if active is not None:
             self.mappers.applied(active, scan.number)
             durable = active.durable if self._adopted_is_durable() else 0
-        for ticket, request in self._tickets.pop((scan.mapper, scan.number), ()):
-            self._answer(ticket, messages.LiveApplied(request, scan.number, durable))
+        for one in self._tickets.pop((scan.mapper, scan.number), ()):
+            self._answer(one.number, messages.LiveApplied(one.request, scan.number, durable))
 
     def _adopted_is_durable(self) -> bool:
         """Return whether all adopted chunks are on disk; the scans in them are not known."""
@@ -320,22 +353,25 @@ class ServedMap:
         self._accept_scans()
         self.readers.lists.expire(now_s)
         residency = self.live.residency
-        marks_bytes = sum(min(message.bytes, MAX_MARKS_BYTES) for _, message in self._waiting)
+        marks_bytes = sum(min(message.bytes, MAX_MARKS_BYTES) for _, _, message in self._waiting)
         residency.beside_bytes += marks_bytes - self._marks_bytes
         self._marks_bytes = marks_bytes
         residency.asked_bytes = self.readers.lists.asked_bytes
         self.live.run_turn(now_s, time.time_ns(), save_all=save_all or bool(self._saves))
+        self._say_why(now_s)
         if self._saves:
             self._answer_saves()
         self.readers.run_turn(now_s)
-        if now_s >= self._manifest_s and self.changes.number != self._listed:
+        due = now_s >= self._manifest_s and self.changes.number != self._listed
+        if due or self.live.files.manifest_is_due:
+            self.live.files.manifest_is_due = False
             self._manifest_s, self._listed = now_s + MANIFEST_S, self.changes.number
             self.live.list_files(self._durable_scans())
 
     def next_turn_s(self, now_s: float) -> float:
         """Return the time at which the next turn is due, if nothing happens before."""
         residency = self.live.residency
-        first_fits = bool(self._waiting) and residency.has_room(self._waiting[0][1].bytes)
+        first_fits = bool(self._waiting) and residency.has_room(self._waiting[0][2].bytes)
         if first_fits or residency.is_ready:
             return now_s
         return min(residency.next_event_s(now_s), self.readers.next_turn_s(now_s))
@@ -347,9 +383,7 @@ class ServedMap:
         if now_s >= self._files_s:
             self._files_s = now_s + FILES_S
             self._file_bytes = sum(row.bytes for row in list(live.files.rows.values()))  # other threads save
-        missing = (f"{key.text}: version {row.version} is missing" for key, row in live.files.missing.items())
-        quarantined = list(live.files.damaged.items())
-        damaged = (f"{name}: {why}" for name, why in quarantined)
+        losses, losses_count = live.files.losses(MAX_LOSSES)
         return messages.LiveMapRow(
             self.settings.name,
             self.settings.path,
@@ -367,13 +401,13 @@ class ServedMap:
             scans=self._scans,
             durable=self._durable,
             budget_bytes=live.limits.budget_bytes,
-            damaged=tuple(islice(chain(missing, damaged), 64)),
+            damaged=losses,
             mappers=tuple(f"{one.mapper.uid}/{one.mapper.name}" for one in self.mappers.by_number.values()),
             problem=live.problem,
             change=self.changes.number,
             beside_bytes=residency.beside_bytes,
             readers=self.readers.busiest,
-            damaged_count=len(live.files.missing) + len(quarantined),
+            damaged_count=losses_count,
             mapper_count=len(self.mappers.by_number),
         )
 

@@ -24,12 +24,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.chunks.chunk_file import decode_chunk
 from shmmap.chunks.layout import ChunkView
 from shmmap.chunks.reading import select_voxels
 from shmmap.chunks.voxels import ChunkKey, voxel_centers
 from shmmap.daemon.live.paged_map import PagedMap
 from shmmap.daemon.live.worker.areas import inside
+from shmmap.daemon.live.worker.lacking import lacking_chunks, shown
 from shmmap.errors import MapDataError, OverBudget
 from shmmap.protocol.live import LiveVoxels, LiveVoxelsReply
 
@@ -108,18 +108,19 @@ class VoxelLists:
     def collect(
         self, message: LiveVoxels, keys: Iterator[list[ChunkKey]], session: int, change: int
     ) -> Steps:
-        """Make a list of the voxels of these chunks; return the reply.
+        """Make a list of the voxels of these chunks; return the reply, which names chunks that are lacking.
 
         Raises
         ------
         OverBudget
             The voxels need more memory than lists may use, or than is free at present.
         MapDataError
-            A file cannot be read.
+            A file cannot be read at present, and may be good.
         OSError
             The list cannot be written.
         """
         parts: list[_Part] = []
+        lacking: dict[ChunkKey, str] = {}
         made = 0
         pick = partial(self._picked, message)
 
@@ -142,14 +143,20 @@ class VoxelLists:
                     elif message.scope != "memory" and key in self.live.files.rows:
                         cold.append(key)
                 for first in range(0, len(cold), FILES_PER_STEP):
-                    for part in (yield partial(self._read, cold[first : first + FILES_PER_STEP], pick)):
+                    found, lost = yield partial(self._read, cold[first : first + FILES_PER_STEP], pick)
+                    for part in found:
                         keep(part)
+                    for key in lost:
+                        self.live.note_lost(key, time.monotonic())
+                        lacking[key] = "its saved file is damaged, or gone"
                 yield None
+            lacking |= yield from lacking_chunks(self.live, message.area)
             yield from self._room(_pages(made))
             name = yield from self._write(parts, made, session)
         finally:
             self._making -= made
-        return LiveVoxelsReply(message.request, change, name, made // VOXEL_BYTES, made)
+        count = made // VOXEL_BYTES
+        return LiveVoxelsReply(message.request, change, name, count, made, *shown(lacking))
 
     def _check(self, made: int, kind: str) -> None:
         most = self.live.limits.budget_bytes // PART_OF_BUDGET
@@ -167,23 +174,26 @@ class VoxelLists:
         wanted = inside(message.area, voxel_centers(indices, self.live.resolution))
         return indices[wanted], log_odds[wanted]
 
-    def _read(self, keys: list[ChunkKey], pick: Callable[[ChunkView], _Part]) -> list[_Part]:
-        """Return voxels of chunks as last saved; called in a thread."""
-        found = []
+    def _read(
+        self, keys: list[ChunkKey], pick: Callable[[ChunkView], _Part]
+    ) -> tuple[list[_Part], list[ChunkKey]]:
+        """Return voxels of chunks as last saved, and the chunks without a good file; called in a thread."""
+        found: list[_Part] = []
+        lost: list[ChunkKey] = []
         for key in keys:
             if self.is_closed:
                 break
             try:
                 data = self.live.files.load(key)
-                if data is not None:
-                    found.append(pick(ChunkView(decode_chunk(data, self.live.identity(key, 0), key.text))))
-            except (FileNotFoundError, MapDataError):
-                continue
             except OSError as error:
                 raise MapDataError(
                     f"it cannot be read: {error.strerror}", path=key.text, cause="unreadable"
                 ) from error
-        return found
+            if data is None:
+                lost.append(key)
+            else:
+                found.append(pick(ChunkView(data)))
+        return found, lost
 
     def _room(self, nbytes: int) -> Steps:
         """Wait until chunks are evicted for a list."""

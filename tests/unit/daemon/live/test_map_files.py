@@ -14,7 +14,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from shmmap.chunks.chunk_file import decode_chunk, encode_chunk
+from shmmap.chunks.chunk_file import encode_chunk
 from shmmap.chunks.layout import ChunkIdentity, ChunkView, new_header
 from shmmap.chunks.occupancy import Occupancy
 from shmmap.chunks.voxels import ChunkKey
@@ -43,7 +43,7 @@ def chunk(made: MapFiles, key: ChunkKey, version: int) -> bytes:
 def version_of(made: MapFiles, key: ChunkKey) -> int:
     """The version that a chunk's file holds, read whole; 0 where there is none."""
     data = made.load(key)
-    return int(ChunkView(decode_chunk(data, identity(made, key))).state["version"]) if data is not None else 0
+    return int(ChunkView(data).state["version"]) if data is not None else 0
 
 
 def test_a_map_is_made_and_found_again(tmp_path: Path) -> None:
@@ -110,7 +110,7 @@ def test_a_damaged_file_is_quarantined_and_never_overwritten(tmp_path: Path) -> 
         "7_7_7.chunk.damaged.1",
     ]
     assert again.rows == {}
-    assert set(again.missing) == set(KEYS)
+    assert set(again.missing) == {*KEYS, ChunkKey(7, 7, 7)}, "of which it is not known what it was"
     again.save(KEYS[0], chunk(again, KEYS[0], 1))
     again.flush()
     assert again.quarantine(KEYS[0], "its body is damaged") == "0_0_0.chunk.damaged.2"
@@ -359,6 +359,7 @@ def test_the_manifest_lists_what_is_durable() -> None:
             "0_0_0": {"version": 4, "bytes": 2688, "active": 0, "occupied": 0, "free": 0, "bricks": 0}
         },
         "applied": {},
+        "missing": {},
     }
     disk.remove("0_0_0.chunk")
     assert list(MapFiles(disk, SETTINGS).missing) == [KEYS[0]]

@@ -5,16 +5,16 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from shmmap.daemon import map_in_memory
 from shmmap.daemon.config_live import LiveSettings
-from shmmap.daemon.host.memory import choose_budget
+from shmmap.daemon.host.memory import choose_budget, room_bytes
 from shmmap.daemon.live.messages import Begin
-from shmmap.daemon.map_in_memory import CEILING_BYTES, bytes_beside_cells, place_live_maps
+from shmmap.daemon.map_in_memory import CEILING_BYTES, CELLS_WITHOUT_MAP, place_live_maps, share_of_live_maps
 from shmmap.errors import CannotStart, ConfigError
 from shmmap.mounts import Mount
 from shmmap.segment.directory import ShmDirectory
@@ -35,11 +35,17 @@ def cells(monkeypatch: pytest.MonkeyPatch) -> Iterator[ShmDirectory]:
 
 
 def placed(
-    cells: ShmDirectory, *maps: str, cells_budget: int = 0, shm_dir: str = "", budget: int = 0
+    cells: ShmDirectory,
+    *maps: str,
+    cells_budget: int = 0,
+    shm_dir: str = "",
+    budget: int = 0,
+    share: int = FREE // 8,
 ) -> Begin:
     return place_live_maps(
         [LiveSettings(name, f"/srv/{name}") for name in maps or ("lidar",)], instance="city", cells=cells,
-        cells_budget_bytes=cells_budget, shm_dir=shm_dir, budget_bytes=budget, gid=5, marks_gid=6,
+        cells_budget_bytes=cells_budget, share_bytes=share, shm_dir=shm_dir, budget_bytes=budget, gid=5,
+        marks_gid=6,
     )  # fmt: skip
 
 
@@ -60,24 +66,10 @@ def test_beside_the_cells(cells: ShmDirectory) -> None:
 def test_a_map_without_a_directory_gets_one(cells: ShmDirectory, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(map_in_memory, "live_directory", lambda instance, name: f"/state/{instance}/{name}")
     begin = place_live_maps(
-        [LiveSettings("lidar")], instance="city", cells=cells, cells_budget_bytes=0, shm_dir="",
-        budget_bytes=0, gid=-1, marks_gid=-1,
+        [LiveSettings("lidar")], instance="city", cells=cells, cells_budget_bytes=0, share_bytes=0,
+        shm_dir="", budget_bytes=0, gid=-1, marks_gid=-1,
     )  # fmt: skip
     assert begin.maps[0].path == "/state/city/lidar"
-
-
-@pytest.mark.parametrize(
-    ("free", "cells_budget", "budget"),
-    [
-        (FREE, 1024 * MIB, 384 * MIB), (FREE, FREE, 4 * MIB), (FREE, 8000 * MIB, 4 * MIB),
-        (8192 * MIB, 0, CEILING_BYTES), (100 * MIB, 0, 100 * MIB // 8), (0, 0, 4 * MIB),
-    ],
-)  # fmt: skip
-def test_an_eighth_of_what_the_cells_leave(
-    cells: ShmDirectory, monkeypatch: pytest.MonkeyPatch, free: int, cells_budget: int, budget: int
-) -> None:
-    monkeypatch.setattr(ShmDirectory, "free_bytes", lambda _self: free)
-    assert placed(cells, cells_budget=cells_budget).budget_bytes == budget
 
 
 def test_what_an_previous_run_left_counts_as_free(
@@ -86,7 +78,7 @@ def test_what_an_previous_run_left_counts_as_free(
     monkeypatch.setattr(ShmDirectory, "free_bytes", lambda _self: 0)
     (Path(cells.path) / "shmmap-live.city.lidar.0_0_0.5").write_bytes(bytes(64 * MIB))
     (Path(cells.path) / "shmmap-live.town.lidar.0_0_0.5").write_bytes(bytes(64 * MIB))
-    assert placed(cells).budget_bytes == 8 * MIB
+    assert placed(cells).budget_bytes == 64 * MIB
     assert placed(cells, budget=60 * MIB).budget_bytes == 60 * MIB
     with pytest.raises(CannotStart, match=r"of 65 MiB do not fit .* 64 MiB free"):
         placed(cells, budget=65 * MIB)
@@ -109,8 +101,7 @@ def test_each_map_gets_a_few_chunks(cells: ShmDirectory, monkeypatch: pytest.Mon
     with pytest.raises(ConfigError, match="5 live maps share 19 MiB; each needs 4") as caught:
         placed(cells, *names, budget=19 * MIB)
     assert "20M at least" in caught.value.hint
-    monkeypatch.setattr(ShmDirectory, "free_bytes", lambda _self: 0)
-    assert placed(cells, *names).budget_bytes == 20 * MIB
+    assert placed(cells, *names, share=0).budget_bytes == 20 * MIB
 
 
 @pytest.mark.parametrize(
@@ -146,40 +137,72 @@ def test_the_innermost_and_last_mount_counts(cells: ShmDirectory, monkeypatch: p
     os.rmdir(below)
 
 
+Budgets = Callable[..., tuple[int, int]]
+
+
+@pytest.fixture
+def budgets(cells: ShmDirectory, monkeypatch: pytest.MonkeyPatch) -> Budgets:
+    """Budgets of cells and of live maps, as `MapInMemory` and the daemon's start choose them."""
+
+    def chosen(
+        size: int, maps: int, *, cells_asked: int = 0, live_asked: int = 0, points: bool = True
+    ) -> tuple[int, int]:
+        monkeypatch.setattr(ShmDirectory, "size_bytes", lambda _self: size)
+        monkeypatch.setattr(ShmDirectory, "free_bytes", lambda _self: size)
+        monkeypatch.setattr("shmmap.daemon.host.memory._memory_bytes", lambda _which: 16 << 30)
+        share = share_of_live_maps(
+            maps, cells=cells, room=room_bytes(cells), shm_dir="", budget_bytes=live_asked, alone=not points
+        )  # fmt: skip
+        asked = cells_asked or (0 if points else CELLS_WITHOUT_MAP)
+        of_cells = choose_budget(asked, cells, beside_bytes=share)
+        if not maps:
+            return of_cells, 0
+        names = [f"m{number}" for number in range(maps)]
+        begin = placed(cells, *names, cells_budget=of_cells, budget=live_asked, share=share)
+        return of_cells, begin.budget_bytes
+
+    return chosen
+
+
+@pytest.mark.parametrize("size", [64 * MIB, 128 * MIB, 256 * MIB, 512 * MIB, 1024 * MIB, 2048 * MIB])
+def test_what_is_not_served_gets_nothing(
+    budgets: Budgets, size: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Points alone, live maps alone, both: nine tenths of a small tmpfs are used, and no part is a crumb."""
+    of_cells, none = budgets(size, 0)
+    assert (of_cells, none) == (size - size // 20, 0)
+    statistics, of_live = budgets(size, 1, points=False)
+    assert statistics == CELLS_WITHOUT_MAP
+    assert of_live == min(size - size // 20 - CELLS_WITHOUT_MAP, CEILING_BYTES)
+    caplog.clear()
+    both = budgets(size, 1)
+    assert both[1] == max(4 * MIB, (size - size // 20) // 8)
+    assert sum(both) == size - size // 20
+    few = "live maps get little memory" in caplog.text
+    assert few == (both[1] < 16 * MIB), "with the remedy"
+    assert ("live_budget" in caplog.text) == few
+
+
 @pytest.mark.parametrize(
-    ("maps", "cells_asked", "live_asked", "fits"),
+    ("maps", "cells_asked", "live_asked", "of_live"),
     [
-        (1, 0, 0, True), (3, 0, 0, True), (1, 0, 32 * MIB, True), (1, 40 * MIB, 0, True),
-        (1, 40 * MIB, 16 * MIB, True),
-        (1, 62 * MIB, 0, False), (1, 40 * MIB, 32 * MIB, False), (16, 0, 0, False), (1, 0, 63 * MIB, False),
+        (1, 0, 0, 7), (3, 0, 0, 12), (1, 0, 32, 32), (1, 40, 0, 7), (1, 40, 16, 16), (1, 58, 0, 6),
+        (1, 62, 0, None), (1, 40, 32, None), (16, 0, 0, None), (1, 0, 63, None),
     ],
 )  # fmt: skip
 def test_a_small_shm_is_shared_by_default_and_refused_where_it_was_set(
-    cells: ShmDirectory,
-    monkeypatch: pytest.MonkeyPatch,
-    maps: int,
-    cells_asked: int,
-    live_asked: int,
-    fits: bool,
+    budgets: Budgets, maps: int, cells_asked: int, live_asked: int, of_live: int | None
 ) -> None:
     """Docker's /dev/shm has 64 MiB: the default budgets make room for each other."""
-    monkeypatch.setattr(ShmDirectory, "size_bytes", lambda _self: 64 * MIB)
-    monkeypatch.setattr(ShmDirectory, "free_bytes", lambda _self: 64 * MIB)
-    names = [f"m{number}" for number in range(maps)]
-
-    def budgets() -> tuple[int, int]:
-        beside = bytes_beside_cells(maps, cells=cells, shm_dir="", budget_bytes=live_asked)
-        of_cells = choose_budget(cells_asked, cells, beside_bytes=beside)
-        return of_cells, placed(cells, *names, cells_budget=of_cells, budget=live_asked).budget_bytes
-
-    if not fits:
+    asked = {"cells_asked": cells_asked * MIB, "live_asked": live_asked * MIB}
+    if of_live is None:
         with pytest.raises((ConfigError, CannotStart)):
-            budgets()
+            budgets(64 * MIB, maps, **asked)
         return
-    of_cells, of_live = budgets()
-    assert of_cells + of_live <= 64 * MIB
-    assert of_cells == (cells_asked or of_cells)
-    assert of_live == (live_asked or 4 * MIB * maps)
+    of_cells, found = budgets(64 * MIB, maps, **asked)
+    assert of_cells + found <= 64 * MIB
+    assert of_cells == (asked["cells_asked"] or of_cells)
+    assert found // MIB == of_live
 
 
 def test_a_directory_of_its_own(cells: ShmDirectory) -> None:

@@ -15,11 +15,14 @@ from shmmap.daemon.telemetry.sampler import (
     BEAT_S,
     CHANGE_BEAT_S,
     CLIENT_ROWS_PER_BEAT,
+    IDLE_AFTER_S,
+    IDLE_BEAT_S,
     RecentCounts,
     Sampler,
     SessionRows,
 )
 from shmmap.daemon.transport.sessions import Sessions
+from shmmap.daemon.turns import WatchedDescriptors
 from shmmap.statistics.layout import MAX_CLIENTS
 from tests.support import connections
 from tests.support.divided_map import DividedMap
@@ -37,10 +40,13 @@ def beat(sampler: Sampler, now_s: float) -> int:
     return count
 
 
-def sampler_of(one: InnerDaemon, on_beat: Callable[[], None] = lambda: None) -> Sampler:
+def sampler_of(
+    one: InnerDaemon, on_beat: Callable[[], None] = lambda: None, watched: WatchedDescriptors | None = None
+) -> Sampler:
     return Sampler(
-        one.cache, one.cache.survey, one.scheduler, one.statistics, one.event_log, one.sessions, (), on_beat
-    )
+        one.cache, one.cache.survey, one.scheduler, one.statistics, one.event_log, one.sessions,
+        watched or WatchedDescriptors(), (), on_beat,
+    )  # fmt: skip
 
 
 def test_a_change_is_written_soon_and_what_was_only_used_with_the_next_whole_beat(
@@ -74,6 +80,38 @@ def test_a_change_is_written_soon_and_what_was_only_used_with_the_next_whole_bea
     beat(sampler, now_s := 1000.0 + BEAT_S)
     assert set(written) == {resident.name for resident in residents}
     assert whole == [1000.0, 1000.0 + BEAT_S]
+
+
+def test_an_idle_daemon_sleeps(inner: Inner, small_map: DividedMap) -> None:
+    """A beat a second in a few steps; what arrives brings the usual beats back at once."""
+    one = inner(small_map.root)
+    one.everything()
+    watched, now_s, beats = WatchedDescriptors(), 1000.0, list[float]()
+    sampler = sampler_of(one, lambda: beats.append(now_s), watched)
+
+    def steps(seconds: float) -> int:
+        """The steps of some seconds in which nothing arrives, each at its time."""
+        nonlocal now_s
+        count, end_s = 0, now_s + seconds
+        while sampler.next_s <= end_s:
+            now_s = max(now_s, sampler.next_s)
+            sampler.run_step(now_s)
+            count += 1
+        now_s = end_s
+        return count
+
+    busy = steps(IDLE_AFTER_S)
+    assert len(beats) >= IDLE_AFTER_S / BEAT_S
+    beats.clear()
+    assert steps(60.0) <= 60 * 6 < busy / IDLE_AFTER_S * 60 / 4
+    assert len(beats) == pytest.approx(60 / IDLE_BEAT_S, abs=1)
+    beats.clear()
+    now_s += 0.3
+    watched.wakes += 1
+    assert sampler.next_s <= now_s
+    steps(1.0)
+    assert len(beats) >= 1.0 / BEAT_S
+    watched.close()
 
 
 def test_outages_of_the_storage(inner: Inner, small_map: DividedMap) -> None:

@@ -15,7 +15,7 @@ from shmmap.chunks.voxels import ChunkKey
 from shmmap.daemon.live.disk.folder import Folder, FolderToRead
 from shmmap.daemon.live.disk.maintenance import CheckedMap, check, repair, reset
 from shmmap.daemon.live.disk.map_files import MapFiles
-from shmmap.daemon.live.disk.map_record import write_rows
+from shmmap.daemon.live.disk.map_record import Listed, write_rows
 from shmmap.daemon.live.disk.stored_map import opened_folder, opened_folder_to_read
 from shmmap.errors import MapDataError
 from tests.support.live_drive import SETTINGS
@@ -195,7 +195,7 @@ def _forget_one(manifest: Path) -> None:
     folder = Folder(manifest.parent)
     rows = dict(MapFiles(folder, SETTINGS).rows)
     rows.popitem()
-    write_rows(folder, rows, {})
+    write_rows(folder, Listed(rows, {}, {}))
     folder.close()
 
 

@@ -281,10 +281,11 @@ def test_the_end_waits_for_no_reader_s_files(served: Served) -> None:
         on_disk(served, ChunkKey(x, 0, 0), Row(1, 100, 0, 0, 0, 1))
     begun, goes_on, read = threading.Event(), threading.Event(), []
 
-    def slow(key: ChunkKey) -> None:
-        read.append(key)
+    def slow(key: ChunkKey, generation: int = 0) -> bytearray | None:
+        read.append((key, generation))
         begun.set()
         goes_on.wait()
+        return None
 
     served.live.files.load = slow  # type: ignore[method-assign]
     try:
@@ -560,7 +561,12 @@ def test_the_disk_is_read_in_threads(filled: Served, lists: VoxelLists, scope: s
             del filled.live.residency.chunks[key]
             filled.live.memory.give_up(filled.live.chunks.pop(key))
     load, where = filled.live.files.load, []
-    filled.live.files.load = lambda key: where.append(threading.get_ident()) or load(key)  # type: ignore[method-assign, func-returns-value]
+
+    def noted(key: ChunkKey, generation: int = 0) -> bytearray | None:
+        where.append(threading.get_ident())
+        return load(key, generation)
+
+    filled.live.files.load = noted  # type: ignore[method-assign]
     ticket = filled.ask(lambda n: LiveVoxels(n, "lidar", scope=scope))
     reply = filled.answer(ticket)
     assert reply.count == VOXELS * len(KEYS)

@@ -1,0 +1,260 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A damaged or lost file of a live map: every way to the map's data says what is lacking."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from shmmap.chunks.voxels import ChunkKey
+from shmmap.daemon.live.disk.exporting import ExportedVoxels, export
+from shmmap.daemon.live.disk.folder import Folder, FolderToRead
+from shmmap.daemon.live.disk.maintenance import CheckedMap, check, repair
+from shmmap.daemon.live.disk.stored_map import StoredMap
+from shmmap.errors import MapDataError
+from shmmap.protocol.live import LiveChunks, LiveVoxels, LiveVoxelsReply
+from shmmap.protocol.messages import ErrorReply
+from tests.support.live_drive import RESOLUTION, Voxel
+from tests.support.live_reference import stored_drive
+from tests.support.served_map import Served
+
+Serve = Callable[..., Served]
+SCOPES = ("memory", "disk", "all")
+
+
+def flipped(at: int) -> Callable[[Path, Path], object]:
+    def do(path: Path, _other: Path) -> None:
+        data = bytearray(path.read_bytes())
+        data[at] ^= 4
+        path.write_bytes(data)
+
+    return do
+
+
+DAMAGES: dict[str, Callable[[Path, Path], object]] = {
+    "a bit of the header": flipped(48),
+    "a bit of the body": flipped(-1),
+    "cut in the header": lambda path, _other: os.truncate(path, 100),
+    "cut in the body": lambda path, _other: os.truncate(path, path.stat().st_size - 1),
+    "empty": lambda path, _other: os.truncate(path, 0),
+    "longer": lambda path, _other: path.write_bytes(path.read_bytes() + b"\0"),
+    "zeros": lambda path, _other: path.write_bytes(bytes(path.stat().st_size)),
+    "zeros in the body": lambda path, _other: path.write_bytes(
+        path.read_bytes()[:128].ljust(path.stat().st_size, b"\0")
+    ),
+    "gone": lambda path, _other: path.unlink(),
+    "of another chunk": lambda path, other: path.write_bytes(other.read_bytes()),
+    "another chunk's own file": lambda path, other: os.replace(other, path),
+}
+
+
+class Damaged:
+    """A map of which the file of one chunk was damaged."""
+
+    def __init__(self, serve: Serve, shm: Path, directory: Path) -> None:
+        self._serve, self.shm, self.directory = serve, shm, directory
+        self.voxels = stored_drive(directory, 2)
+        paths = sorted(directory.glob("*.chunk"), key=lambda path: path.stat().st_size)
+        self.path, self.other = paths[-1], paths[0]
+        self.key, self.other_key = (
+            ChunkKey.from_text(path.name.removesuffix(".chunk")) for path in (self.path, self.other)
+        )
+        self.lost = {self.key}
+
+    def damage(self, name: str) -> None:
+        DAMAGES[name](self.path, self.other)
+        if not self.other.exists():
+            self.lost = {self.key, self.other_key}
+
+    @property
+    def left(self) -> dict[Voxel, int]:
+        """The voxels of all other chunks."""
+        return {
+            voxel: value
+            for voxel, value in self.voxels.items()
+            if ChunkKey(*(index >> 6 for index in voxel)) not in self.lost
+        }
+
+    def serve(self) -> Served:
+        return self._serve()
+
+    def answer(self, served: Served, scope: str) -> tuple[set[ChunkKey], dict[Voxel, int]]:
+        """The chunks that are said to be lacking, and the voxels."""
+        found: dict[Voxel, int] = {}
+        lacking: set[ChunkKey] = set()
+        for kind in ("occupied", "free"):
+            reply: LiveVoxelsReply = served.answer(
+                served.ask(lambda n, kind=kind: LiveVoxels(n, "lidar", kind, scope=scope))  # type: ignore[misc]
+            )
+            assert reply.lacking_count == len(reply.lacking)
+            lacking |= {ChunkKey(*one.key) for one in reply.lacking}
+            data = (self.shm / reply.segment[1:]).read_bytes()
+            indices = np.frombuffer(data, "<i4", 3 * reply.count).reshape(-1, 3).tolist()
+            for voxel, value in zip(
+                indices, np.frombuffer(data, "<i2", offset=12 * reply.count).tolist(), strict=True
+            ):
+                found[voxel[0], voxel[1], voxel[2]] = value
+        return lacking, found
+
+    def checked(self, *, mend: bool = False) -> CheckedMap:
+        """What ``fsck`` says; with ``mend`` after a repair."""
+        folder = Folder(self.directory) if mend else FolderToRead(self.directory)
+        try:
+            found = check(folder, str(self.directory))
+            if isinstance(folder, Folder):
+                repair(folder, found)
+            return found
+        finally:
+            folder.close()
+
+    def exported(self) -> ExportedVoxels | None:
+        files = FolderToRead(self.directory)
+        try:
+            return export(
+                StoredMap(files, str(self.directory)), self.shm / "out.ply", "ply", voxels="both", force=True
+            )
+        finally:
+            files.close()
+
+    def all_say_so(self, served: Served) -> None:
+        """Each answer, the state of the map, the check of the files, and the export."""
+        row = served.map.status()
+        text = " ".join(row.damaged)
+        assert row.damaged_count == len(row.damaged) >= len(self.lost)
+        assert all(key.text in text for key in self.lost), text
+        for scope in SCOPES:
+            lacking, found = self.answer(served, scope)
+            assert lacking == self.lost, scope
+            if scope != "memory":
+                assert found == self.left, scope
+        page = served.answer(served.ask(lambda n: LiveChunks(n, "lidar", since=1)))
+        assert {ChunkKey(*one.key) for one in page.lacking} == self.lost
+        checked = self.checked()
+        assert not checked.good
+        assert {one.chunk for one in checked.missing} == {key.text for key in self.lost}
+        made = self.exported()
+        assert made is not None
+        assert set(made.missing) == {key.text for key in self.lost}
+        assert made.voxels == len(self.left)
+
+
+@pytest.fixture
+def damaged(serve: Serve, shm: Path, tmp_path: Path) -> Damaged:
+    return Damaged(serve, shm, tmp_path / "map")
+
+
+@pytest.mark.parametrize(
+    ("name", "when", "noticed"),
+    [
+        (name, when, ("disk", "all", "loading")[(number + 2 * turn) % 3])
+        for turn, when in enumerate(("stopped", "running"))
+        for number, name in enumerate(DAMAGES)
+    ],
+)
+def test_what_is_lost_is_named_by_all_until_it_is_forgotten(
+    damaged: Damaged, name: str, when: str, noticed: str
+) -> None:
+    """Whatever notices it first; over a restart, and when the chunk was mapped again."""
+    if when == "running":
+        served = damaged.serve()
+        damaged.damage(name)
+    else:
+        damaged.damage(name)
+        if name != "gone":
+            with pytest.raises(MapDataError, match="fsck"):
+                damaged.exported()
+        assert not damaged.checked().good
+        served = damaged.serve()
+    if noticed == "loading":
+        for key in damaged.lost:
+            served.live.move("client", tuple((index + 0.5) * 64 * RESOLUTION for index in key))  # type: ignore[arg-type]
+            served.until(lambda key=key: key in served.live.chunks)  # type: ignore[misc]
+    else:
+        lacking, found = damaged.answer(served, noticed)
+        assert (lacking, found) == (damaged.lost, damaged.left)
+    served.until(lambda: not served.live.files.manifest_is_due)
+    served.until(lambda: served.live._threads.are_idle)
+    damaged.all_say_so(served)
+    served.end(keep=True)  # as after a kill
+    served = damaged.serve()
+    damaged.all_say_so(served)
+    served.end()
+    damaged.checked(mend=True)
+    served = damaged.serve()
+    assert damaged.answer(served, "all") == (set(), damaged.left), "forgotten"
+    assert served.map.status().damaged_count == 0
+
+
+def _nothing() -> object:
+    import contextlib
+
+    return contextlib.nullcontext()
+
+
+@pytest.mark.parametrize("name", ["a bit of the body", "gone", "of another chunk"])
+@pytest.mark.parametrize("dies", [False, True])
+def test_what_memory_has_is_saved_again(damaged: Damaged, name: str, dies: bool) -> None:
+    """The list from the disk lacks it just once; also if the worker dies before it is saved."""
+    served = damaged.serve()
+    served.live.move("client", tuple((index + 0.5) * 64 * RESOLUTION for index in damaged.key))  # type: ignore[arg-type]
+    served.until(lambda: damaged.key in served.live.chunks)
+    damaged.damage(name)
+    assert damaged.answer(served, "all") == (set(), damaged.voxels)
+    ticket = served.ask(lambda n: LiveVoxels(n, "lidar", scope="disk"))
+    assert {ChunkKey(*one.key) for one in served.answer(ticket).lacking} == {damaged.key}
+    if dies:
+        served.end(keep=True)
+        served = damaged.serve()
+    served.until(lambda: served.map.is_saved, save_all=True)
+    for scope in ("disk", "all"):
+        assert damaged.answer(served, scope) == (set(), damaged.voxels)
+    served.end()
+    checked = damaged.checked()
+    assert checked.good
+    assert checked.manifest == "current"
+
+
+def test_a_file_that_is_put_back_is_lost_no_more(damaged: Damaged) -> None:
+    whole = damaged.path.read_bytes()
+    damaged.damage("gone")
+    served = damaged.serve()
+    damaged.all_say_so(served)
+    served.end()
+    damaged.path.write_bytes(whole)
+    served = damaged.serve()
+    assert damaged.answer(served, "all") == (set(), damaged.voxels)
+    assert served.map.status().damaged_count == 0
+    served.end()
+    assert damaged.checked().good
+
+
+def test_a_file_that_cannot_be_read_at_present_is_a_problem_until_it_can(damaged: Damaged) -> None:
+    """It may be good: nothing is lost, and nothing is answered without it."""
+    served = damaged.serve()
+    hidden = damaged.path.with_name("hidden")
+    damaged.path.rename(hidden)
+    damaged.path.mkdir()
+    for scope in ("disk", "all"):
+        refused = served.answer(served.ask(lambda n, scope=scope: LiveVoxels(n, "lidar", scope=scope)))  # type: ignore[misc]
+        assert isinstance(refused, ErrorReply)
+        assert "it is a directory" in refused.message
+    assert damaged.key.text in served.map.status().problem
+    assert served.map.status().damaged_count == 0
+    damaged.path.rmdir()
+    hidden.rename(damaged.path)
+    served.until(lambda: not served.map.status().problem)
+    assert damaged.answer(served, "all") == (set(), damaged.voxels)
+
+
+def test_a_file_that_is_replaced_while_it_is_read_is_not_lost(damaged: Damaged) -> None:
+    """What looks damaged is read again while no file gets its name."""
+    served = damaged.serve()
+    files, whole = served.live.files.files, damaged.path.read_bytes()
+    read = files.read
+    files.read = lambda name, most=1 << 28: setattr(files, "read", read) or read(name, most)[:-1]  # type: ignore[method-assign, assignment, misc]
+    assert damaged.answer(served, "all") == (set(), damaged.voxels)
+    assert damaged.path.read_bytes() == whole
