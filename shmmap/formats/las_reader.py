@@ -9,11 +9,12 @@ scale applied.
 
 from __future__ import annotations
 
+import io
 import os
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from types import TracebackType
-from typing import Any, Final
+from typing import IO, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 from shmmap.columns import ColumnSpec, column_names
 from shmmap.errors import MapDataError, PackageMissing
 from shmmap.formats.coordinate_system import unit_warnings
-from shmmap.formats.las_header import read_las_header
+from shmmap.formats.las_header import LasHeader, read_las_header
 from shmmap.formats.laz_chunks import check_laz
 from shmmap.formats.source_file import refusal
 
@@ -93,14 +94,17 @@ class LasReader:
                 checked.warnings.append(
                     f"the header counts {self.points} points, the compressed data {counted}"
                 )
-            self._reader = laspy.open(undo.enter_context(open(self.path, "rb")), **backends)
-            self._read_header(laspy, checked.points)
+            source = _Source(checked.head, undo.enter_context(open(self.path, "rb")))
+            self._reader = laspy.LasReader(source, **backends)
+            source.to_points(checked.data_at)
+            self._read_header(laspy, checked)
             undo.pop_all()
         self.warnings: tuple[str, ...] = (*checked.warnings, *unit_warnings(checked.crs))
 
-    def _read_header(self, laspy: Any, points: int) -> None:
+    def _read_header(self, laspy: Any, checked: LasHeader) -> None:
         header = self._reader.header
-        header.point_count = points  # laspy trusts a wide count of 0
+        header.offset_to_point_data = checked.data_at
+        header.point_count = checked.points  # laspy trusts a wide count of 0
         self.version = str(header.version)
         self.encoding = ""
         low, high = np.array(header.mins, np.float64), np.array(header.maxs, np.float64)
@@ -161,6 +165,22 @@ class LasReader:
         for column, name in zip(self._columns, self._names, strict=True):
             block[column] = np.asarray(record[name])
         return block
+
+
+class _Source:
+    """A file for laspy, which reads a header from memory first, and then the file."""
+
+    def __init__(self, head: bytes, file: IO[bytes]) -> None:
+        self._file = file
+        self._read_from: IO[bytes] = io.BytesIO(head)
+
+    def to_points(self, data_at: int) -> None:
+        """Continue in the file, at its points."""
+        self._file.seek(data_at)
+        self._read_from = self._file
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._read_from, name)
 
 
 @contextmanager
