@@ -107,7 +107,7 @@ class DaemonConfig:
         "",
         "unit of a cloud's coordinates, converted to metres; auto takes what the file says",
         allowed=one_of(*UNITS),
-        unset="metres, and a file that says feet is refused",
+        unset="metres, and a file that states another unit is refused",
     )
     vertical_unit: str = setting(
         "",

@@ -26,7 +26,7 @@ from xxhash import xxh3_64_hexdigest
 
 from shmmap.errors import BadRequest, CannotWrite, InternalError, MapMissing, error_from_wire
 from shmmap.formats.cloud import READABLE_SUFFIXES
-from shmmap.formats.coordinate_system import FEET
+from shmmap.formats.coordinate_system import LENGTHS
 from shmmap.formats.durable_file import locked_entry, locked_file
 from shmmap.logfmt import log
 from shmmap.origin.catalogue import Catalogue, MapOrigin
@@ -80,11 +80,11 @@ def find_origin(
     path = absolute_path(map_path)
     suffix = os.path.splitext(path)[1].lower()
     is_cloud = os.path.isfile(path) and suffix in READABLE_SUFFIXES and not metadata
-    in_feet = unit in FEET or vertical_unit in FEET
-    if is_cloud and (in_feet or not (suffix == ".pcd" and is_served_whole(path))):
+    converts = unit in LENGTHS or vertical_unit in LENGTHS
+    if is_cloud and (converts or not (suffix == ".pcd" and is_served_whole(path))):
         cache_dir = absolute_path(cache_dir or default_cache_directory())
         return DividedCloud(path, cache_dir, strict=strict, units=(unit, vertical_unit), notify=notify)
-    if in_feet:
+    if converts:
         raise BadRequest(
             f"{path} is a divided map, not a cloud: it is not converted",
             hint="divide its cloud again: shmmap divide --unit",

@@ -248,6 +248,7 @@ class _BinaryPcd(Source):
 
     def __init__(self, reader: PcdReader) -> None:
         super().__init__(reader.path, reader.header.points, _row_of_records(reader), reader.warnings)
+        self.crs = reader.header.crs
         self._reader = reader
         self._at = 0
         self._direct = False
@@ -331,6 +332,7 @@ class _StreamedPcd(_Stream):
     def __init__(self, reader: PcdReader, memory_bytes: int, scratch_dir: str) -> None:
         header = reader.header
         super().__init__(reader.path, header.points, reader.columns, reader.warnings)
+        self.crs = header.crs
         self._scratch_dir = scratch_dir
         expanded = header.points * header.point_bytes
         packed = os.fstat(reader.fileno()).st_size

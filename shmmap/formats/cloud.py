@@ -11,7 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.columns import Bounds, ColumnSpec
-from shmmap.formats.coordinate_system import GEOGRAPHIC_SYSTEM, CoordinateSystem, degrees_warning
+from shmmap.formats.coordinate_system import (
+    GEOGRAPHIC_SYSTEM,
+    CoordinateSystem,
+    degrees_warning,
+    unit_warnings,
+)
 from shmmap.formats.las_reader import LAS_SUFFIXES, LasReader
 from shmmap.formats.pcd.header import IDENTITY_VIEWPOINT
 from shmmap.formats.pcd.reader import PcdReader
@@ -168,7 +173,7 @@ def read_pcd(path: str | os.PathLike[str], *, keep_non_finite: bool = False) -> 
             dropped=reader.dropped,
             bounds=reader.bounds,
             viewpoint=reader.header.viewpoint,
-            warnings=reader.warnings,
+            warnings=(*reader.warnings, *unit_warnings(reader.header.crs)),
         )
 
 
@@ -201,7 +206,7 @@ def read_cloud(path: str | os.PathLike[str], *, keep_non_finite: bool = False) -
             points=reader.points,
             dropped=reader.points - kept,
             bounds=bounds.result(),
-            warnings=reader.warnings,
+            warnings=(*reader.warnings, *unit_warnings(reader.crs)),
         )
 
 
@@ -240,7 +245,8 @@ def _described(path: str | os.PathLike[str]) -> CloudDescription:
             columns=reader.columns,
             bounds=reader.bounds,
             viewpoint=header.viewpoint,
-            warnings=reader.warnings,
+            warnings=(*reader.warnings, *unit_warnings(header.crs)),
+            crs=header.crs,
             digest=reader.digest,
         )
 
@@ -263,7 +269,7 @@ def _describe_blocks(path: str, suffix: str) -> CloudDescription:
             height=1,
             columns=reader.columns,
             bounds=bounds.result(),
-            warnings=reader.warnings,
+            warnings=(*reader.warnings, *unit_warnings(reader.crs)),
             crs=reader.crs,
         )
 

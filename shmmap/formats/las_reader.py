@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from shmmap.columns import ColumnSpec, column_names
 from shmmap.errors import MapDataError, PackageMissing
-from shmmap.formats.coordinate_system import unit_warnings
 from shmmap.formats.las_header import LasHeader, read_las_header
 from shmmap.formats.laz_chunks import check_laz
 from shmmap.formats.source_file import refusal
@@ -99,7 +98,7 @@ class LasReader:
             source.to_points(checked.data_at)
             self._read_header(laspy, checked)
             undo.pop_all()
-        self.warnings: tuple[str, ...] = (*checked.warnings, *unit_warnings(checked.crs))
+        self.warnings: tuple[str, ...] = tuple(checked.warnings)
 
     def _read_header(self, laspy: Any, checked: LasHeader) -> None:
         header = self._reader.header

@@ -67,7 +67,7 @@ class PlyReader(FileReader):
         super().__init__(path)
         self._table = FieldTable(self._header.fields)
         self._oddities: list[str] = []
-        self.crs: CoordinateSystem | None = None
+        self.crs: CoordinateSystem | None = self._header.crs
         self.bounds: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
         self.version = ""
         self.points = self._header.vertex.count

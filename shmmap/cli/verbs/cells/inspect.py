@@ -86,7 +86,12 @@ def run(args: argparse.Namespace) -> int:
         print_table(
             (Column("FIELD"), Column("DTYPE"), Column("COUNT", "right"), Column("UNIT")),
             [
-                [_field_name(spec.name), spec.dtype.str, str(spec.components), spec.unit]
+                [
+                    _field_name(spec.name),
+                    spec.dtype.str,
+                    str(spec.components),
+                    spec.unit if spec.name != "xyz" or _in_metres(found.crs) else "",
+                ]
                 for spec in found.columns
             ],
         )
@@ -288,7 +293,7 @@ def _crs_lines(crs: CoordinateSystem | None) -> list[tuple[str, str]]:
 
     said = "x and y are in degrees" if crs.geographic else units_text(*crs.units)
     unsaid = "" if crs.geographic or crs.plane is not None else " (taken so: the file does not say)"
-    return [("crs", crs.label or "without a name"), ("units", said + unsaid)]
+    return [*([("crs", crs.label)] if crs.label else []), ("units", said + unsaid)]
 
 
 def _in_metres(crs: CoordinateSystem | None) -> bool:
