@@ -115,6 +115,11 @@ class DaemonConfig:
         allowed=one_of(*UNITS),
         unset="that of its coordinates, or what the file says",
     )
+    drop_noise: bool = setting(
+        False,
+        "leave out points of a cloud that its LAS file classifies as noise (classes 7 and 18); those flagged "
+        "withheld are always left out",
+    )
     strict: bool = setting(False, "accept only what Autoware's own loader accepts")
     watch: bool = setting(
         False,

@@ -30,10 +30,10 @@ from shmmap.formats.coordinate_system import (
     LengthUnit,
     units_text,
 )
+from shmmap.formats.point_checks import FLOAT32_REACH_M
 from shmmap.formats.source_file import refusal
 
 __all__ = [
-    "FLOAT32_REACH_M",
     "Frame",
     "InputUnits",
     "Translation",
@@ -41,9 +41,6 @@ __all__ = [
     "choose_units",
     "frame_between",
 ]
-
-FLOAT32_REACH_M: Final = 16384.0
-"""Below this, rounding to float32 moves a coordinate by less than half a millimetre."""
 
 _SCAN_POINTS: Final = 1 << 20
 _ROUNDING: Final = 1.001  # bounds in headers are rounded

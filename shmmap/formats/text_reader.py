@@ -22,6 +22,7 @@ from shmmap.columns import ColumnSpec, column_names
 from shmmap.errors import MapDataError
 from shmmap.formats.coordinate_system import CoordinateSystem, LengthUnit
 from shmmap.formats.pcd.fields import AXES, MAX_FIELDS, FieldTable, PcdField
+from shmmap.formats.point_checks import NAME_THEM, TextChecks
 from shmmap.formats.source_file import FileReader, refusal
 from shmmap.formats.stated_units import (
     coordinates_of,
@@ -47,7 +48,8 @@ _COLOURS: Final = ("red", "green", "blue")
 _UNNAMED: Final = {1: ("intensity",), 3: _COLOURS, 4: ("intensity", *_COLOURS)}
 """Names of the columns after x, y and z, by their number, as in PTS files."""
 _NORMAL_LENGTHS: Final = (0.99, 1.01)
-_LOOKED_AT: Final = 32  # rows to look at
+_LOOKED_AT: Final = 1024  # rows to look at
+_LOOKED_AT_NORMALS: Final = 32
 _SHOWN: Final = 60
 
 
@@ -66,6 +68,7 @@ class _Layout:
     announced: int | None = None
     crs: CoordinateSystem | None = None
     warnings: tuple[str, ...] = ()
+    guessed: bool = False
 
 
 class TextReader(FileReader):
@@ -81,6 +84,8 @@ class TextReader(FileReader):
         Units that the file states; None if it states none.
     warnings
         Oddities of the file.
+    checks
+        What is odd about the points; what reads points adds them.
 
     Raises
     ------
@@ -96,6 +101,7 @@ class TextReader(FileReader):
         self.bounds: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
         self.encoding = self.version = ""
         self.warnings: tuple[str, ...] = self._layout.warnings
+        self.checks = TextChecks(guessed=self._layout.guessed)
 
     def _read_header(self) -> None:
         head = self._source.peek(min(self._source.size, _HEAD_BYTES))
@@ -188,6 +194,7 @@ class _Lines:
         self.path = path
         self.suffix = suffix
         self.file_bytes = file_bytes
+        self.whole = file_bytes <= len(head)
 
     def layout(self) -> _Layout:
         """Return the file's layout."""
@@ -288,29 +295,58 @@ class _Lines:
             )
         layout.crs = system_of_comments(comments)
         others = count - 3
+        layout.guessed = True
+        rows = self._first_rows(layout)
+        warnings = []
         names_of_others: Sequence[str] = _UNNAMED.get(others, ())
-        if others == 3 and (self.suffix == ".xyzn" or self._normals(layout)):
+        if others == 3 and (self.suffix == ".xyzn" or (self.suffix != ".xyzrgb" and _are_normals(rows))):
             names_of_others = _NORMALS
+        elif names_of_others[-3:] == _COLOURS and not self._are_colours(rows[:, -3:]):
+            names_of_others = ()
+            warnings.append(f"columns {count - 2} to {count} are no colours, which are integers of 0 to 255")
+            if len(rows) > 1 and _are_bytes(rows[:, :3]):
+                raise self._error(
+                    "bad_row",
+                    "columns 1 to 3 look like a colour (integers of 0 to 255), the last three do not",
+                    layout.data_at,
+                    hint=f"no header says which columns are coordinates: {NAME_THEM}",
+                )
+        if others and len(rows) > 2 and (np.diff(rows[:, 0]) == 1).all() and (rows[:, 0] % 1 == 0).all():
+            warnings.append(f"the first column counts the rows: if it is no coordinate, {NAME_THEM}")
         if not names_of_others:
             names_of_others = [f"column_{place}" for place in range(4, count + 1)]
         layout.names = [*AXES, *names_of_others]
         if others and not (others == 3 and self.suffix in (".xyzn", ".xyzrgb")):
             taken = ", ".join(names_of_others)
-            layout.warnings = (f"no header names the columns: after x, y and z they are taken as {taken}",)
+            warnings.insert(0, f"no header names the columns: after x, y and z they are taken as {taken}")
+        layout.warnings = tuple(warnings)
 
-    def _normals(self, layout: _Layout) -> bool:
-        """Whether columns 4 to 6 of the first rows are unit vectors, not all along an axis."""
-        if self.suffix == ".xyzrgb":
-            return False
-        vectors = []
-        for line in self.head[layout.data_at :].split(b"\n")[:-1][:_LOOKED_AT]:
-            words = line.replace(layout.separator or b" ", b" ").split()[3:6]
-            if len(words) == 3 and all(map(NUMBER.match, words)):
-                vectors.append([float(word) for word in words])
-        if not vectors or not any(0 < abs(value) < 1 for value in vectors[0]):
-            return False
-        lengths = np.linalg.norm(np.array(vectors), axis=1)
-        return bool((lengths > _NORMAL_LENGTHS[0]).all() and (lengths < _NORMAL_LENGTHS[1]).all())
+    def _first_rows(self, layout: _Layout) -> NDArray[np.float64]:
+        """Return the first rows, (N, columns), as far as they are whole and numbers."""
+        count, rows = len(layout.names), []
+        for line in self.head[layout.data_at :].split(b"\n")[: None if self.whole else -1][:_LOOKED_AT]:
+            words = line.replace(layout.separator or b" ", b" ").split()
+            if len(words) == count and all(map(NUMBER.match, words)):
+                rows.append([float(word) for word in words])
+        return np.array(rows, np.float64).reshape(-1, count)
+
+    def _are_colours(self, values: NDArray[np.float64]) -> bool:
+        """Whether three columns can be a colour; in a file that says so by its name, up to 1, too."""
+        floats = self.suffix == ".xyzrgb" and ((values >= 0) & (values <= 1)).all()
+        return bool(floats) or _are_bytes(values)
+
+
+def _are_bytes(values: NDArray[np.float64]) -> bool:
+    return bool(((values >= 0) & (values <= 255) & (values % 1 == 0)).all())
+
+
+def _are_normals(rows: NDArray[np.float64]) -> bool:
+    """Whether columns 4 to 6 of the first rows are unit vectors, not all along an axis."""
+    vectors = rows[:_LOOKED_AT_NORMALS, 3:6]
+    if not len(vectors) or not any(0 < abs(value) < 1 for value in vectors[0]):
+        return False
+    lengths = np.linalg.norm(vectors, axis=1)
+    return bool((lengths > _NORMAL_LENGTHS[0]).all() and (lengths < _NORMAL_LENGTHS[1]).all())
 
 
 def _splits(text: str, separator: str, count: int) -> Iterator[list[str]]:

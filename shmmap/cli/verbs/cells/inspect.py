@@ -41,7 +41,7 @@ _FILES = (
     Column("FORMAT", spare=4),
     Column("SIZE", "right", spare=3),
     Column("POINTS", "right"),
-    Column("NOT FINITE", "right", spare=6),
+    Column("LEFT OUT", "right", spare=6),
     Column("X", "right", spare=1),
     Column("Y", "right", spare=1),
     Column("Z", "right", spare=2),
@@ -154,7 +154,7 @@ def _directory(args: argparse.Namespace) -> int:
         print_pairs(
             [
                 ("files", f"{len(found):,}" + (f", {len(failed):,} that cannot be read" if failed else "")),
-                ("points", f"{points:,}" + (f", {dropped:,} not finite" if dropped else "")),
+                ("points", f"{points:,}" + (f", {dropped:,} left out" if dropped else "")),
                 ("size", format_bytes(nbytes)),
                 *_bounds_lines(bounds),
                 *_grouped_warnings(found),
@@ -317,7 +317,7 @@ def _lines(found: CloudDescription) -> list[tuple[str, str]]:
     kind = " ".join(part for part in (found.format.upper(), found.version, found.encoding) if part)
     lines = [
         ("file", f"{found.path} ({format_bytes(found.file_bytes)}, {kind})"),
-        ("points", f"{found.points:,}" + (f", {found.dropped:,} not finite" if found.dropped else "")),
+        ("points", f"{found.points:,}" + (f", {found.dropped:,} left out" if found.dropped else "")),
     ]
     if found.height > 1:
         lines.append(("organised", f"{found.width} x {found.height}"))
