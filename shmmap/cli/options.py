@@ -224,17 +224,24 @@ def layers_from(args: argparse.Namespace) -> list[str]:
     return args.layer or ["points"]
 
 
-def add_unit_options(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -> None:
-    """Add ``--unit`` and ``--vertical-unit``, for clouds whose coordinates are not in metres."""
-    choices = ("auto", "m", "ft", "us-ft")
+def add_cloud_options(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -> None:
+    """Add options for reading clouds: ``--unit``, ``--vertical-unit`` and ``--drop-noise``."""
+    from shmmap.formats.coordinate_system import UNITS
+
     parser.add_argument(
         "--unit",
-        choices=choices,
+        choices=UNITS,
         help="unit of the cloud's coordinates, converted to metres: auto takes what the file says; without "
-        "this option, a file that says feet is refused",
+        "this option, a file that states another unit than metres is refused",
     )
     parser.add_argument(
         "--vertical-unit",
-        choices=choices,
+        choices=UNITS,
         help="unit of its heights, where it differs from what --unit and the file say",
+    )
+    parser.add_argument(
+        "--drop-noise",
+        action="store_true",
+        help="leave out points that a LAS file classifies as noise (classes 7 and 18); those flagged "
+        "withheld are always left out",
     )

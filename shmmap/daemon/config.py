@@ -107,13 +107,18 @@ class DaemonConfig:
         "",
         "unit of a cloud's coordinates, converted to metres; auto takes what the file says",
         allowed=one_of(*UNITS),
-        unset="metres, and a file that says feet is refused",
+        unset="metres, and a file that states another unit is refused",
     )
     vertical_unit: str = setting(
         "",
         "unit of a cloud's heights, where it differs from that of its coordinates",
         allowed=one_of(*UNITS),
         unset="that of its coordinates, or what the file says",
+    )
+    drop_noise: bool = setting(
+        False,
+        "leave out points of a cloud that its LAS file classifies as noise (classes 7 and 18); those flagged "
+        "withheld are always left out",
     )
     strict: bool = setting(False, "accept only what Autoware's own loader accepts")
     watch: bool = setting(

@@ -187,6 +187,7 @@ def _origin_here(config: DaemonConfig) -> ViewOrigin:
         cache_dir=config.cache_dir,
         unit=config.unit,
         vertical_unit=config.vertical_unit,
+        drop_noise=config.drop_noise,
         notify=notify,
     )
 
@@ -202,7 +203,7 @@ def _published(config: DaemonConfig) -> PublishedOrigin | None:
         )
     if not config.trust and not is_published(path):
         return None
-    for name in ("metadata", "unit", "vertical_unit", "watch"):
+    for name in ("metadata", "unit", "vertical_unit", "drop_noise", "watch"):
         if getattr(config, name):
             raise ConfigError(
                 f"{option_of(name)} is not for a published map",

@@ -66,12 +66,16 @@ def _frame_before(out: str) -> tuple[float, float, float] | None:
 
 
 def main(arguments: list[str]) -> int:
-    """Run with ``CHANNEL_FD PARENT_PID CLOUD OUT UNIT VERTICAL_UNIT``; return the error's exit code."""
+    """Run with ``CHANNEL_FD PARENT_PID CLOUD OUT UNIT VERTICAL_UNIT DROP_NOISE``; return its exit code."""
     channel = _Channel(channel_to_parent(arguments))
     os.nice(_NICENESS)
     # the settings of `shmmap divide`, for an equal map; a changed cloud keeps the frame of its last division
     settings = DivideSettings(
-        resume=True, frame_before=_frame_before(arguments[3]), unit=arguments[4], vertical_unit=arguments[5]
+        resume=True,
+        frame_before=_frame_before(arguments[3]),
+        unit=arguments[4],
+        vertical_unit=arguments[5],
+        drop_noise=bool(arguments[6]),
     )
     try:
         divide([arguments[2]], arguments[3], settings, progress=channel)

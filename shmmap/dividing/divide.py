@@ -12,6 +12,7 @@ from dataclasses import asdict
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shmmap.dividing.cell_files import CellFiles, raise_open_files_limit, write_metadata
 from shmmap.dividing.finishing import thin_out, write_encoded
@@ -33,6 +34,7 @@ from shmmap.errors import BadRequest, MapDataError
 from shmmap.formats.coordinate_system import GEOGRAPHIC_SYSTEM, degrees_warning
 from shmmap.formats.durable_file import writing_errors
 from shmmap.formats.pcd.reader import PcdReader
+from shmmap.formats.point_checks import step_warning
 from shmmap.formats.source_file import refusal
 from shmmap.origin.map_report import DividedMap, far_cells_notes, write_report
 from shmmap.progress import NoProgress, Progress
@@ -111,7 +113,12 @@ class _Run:
         room = memory_left(settings.memory_bytes)
         self._sources: list[Source] = []
         for file in files:
-            source = open_source(file.path, memory_bytes=room // 2, scratch_dir=space.path)
+            source = open_source(
+                file.path,
+                memory_bytes=room // 2,
+                scratch_dir=space.path,
+                drop_noise=settings.drop_noise,
+            )
             stack.callback(source.close)
             self._sources.append(source)
         self._units = choose_units(self._sources, settings.unit, settings.vertical_unit)
@@ -196,6 +203,7 @@ class _Run:
                     "kept": partition.kept,
                     "dropped": partition.dropped,
                     "extremes": partition.extremes.tolist(),
+                    "checks": [source.checks.counts for source in self._sources],
                 }
                 self._space.save(state)
 
@@ -216,6 +224,8 @@ class _Run:
                 files.restore(((ix, iy, rows) for ix, iy, rows in state["cells"]), state["noted_bytes"])
                 partition.kept, partition.dropped = state["kept"], state["dropped"]
                 partition.extremes = np.array(state["extremes"])
+                for source, counts in zip(self._sources, state["checks"], strict=True):
+                    source.checks.counts = counts
                 return int(state["position"])
         files.forget()
         self._space.clear("map/" + _CELLS)
@@ -291,6 +301,7 @@ class _Run:
             "lattice": asdict(self._lattice),
             "buckets": asdict(self._buckets),
             "prefix": settings.prefix,
+            "drop_noise": settings.drop_noise,
             "staged": bool(settings.leaf or self._is_encoded),
         }
         loaded: dict[str, Any] = json.loads(json.dumps(job))
@@ -299,7 +310,8 @@ class _Run:
     def _report(self, read: Partition, cells: CellFiles) -> DividedMap:
         notes = [*self._units.notes, *self._frame.notes]
         for source in self._sources:
-            notes += [f"{source.path}: {warning}" for warning in source.warnings]
+            notes += [f"{source.path}: {note}" for note in (*source.warnings, *source.checks.notes())]
+        notes += self._steps(read.extremes)
         if not any(GEOGRAPHIC_SYSTEM in note for note in notes):
             low, high = read.extremes + self._frame.origin
             notes += [warning] if (warning := degrees_warning(low, high)) else []
@@ -336,6 +348,13 @@ class _Run:
             crs=self._units.crs,
             unit_m=self._units.unit_m,
         )
+
+    def _steps(self, extremes: NDArray[np.float64]) -> list[str]:
+        """Return a note if the inputs' coordinates are float32, and too large for it."""
+        single = [source for source in self._sources if source.row["x"].itemsize == 4]
+        note = step_warning(*(extremes + self._frame.origin), np.dtype(np.float32)) if single else ""
+        where = single[0].path if len(single) == 1 else f"{len(single)} inputs"
+        return [f"{where}: {note}"] if note else []
 
 
 def _check_cells(

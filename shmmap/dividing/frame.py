@@ -21,11 +21,19 @@ from shmmap.columns import Bounds
 from shmmap.dividing.lattice import CellLattice
 from shmmap.dividing.sources import NO_MOVE, NO_SCALE, Bound3, RowLayout, Source
 from shmmap.errors import BadRequest, MapDataError
-from shmmap.formats.coordinate_system import FEET, METRE, UNITS, CoordinateSystem, LengthUnit, units_text
+from shmmap.formats.coordinate_system import (
+    GEOGRAPHIC_SYSTEM,
+    LENGTHS,
+    METRE,
+    UNITS,
+    CoordinateSystem,
+    LengthUnit,
+    units_text,
+)
+from shmmap.formats.point_checks import FLOAT32_REACH_M
 from shmmap.formats.source_file import refusal
 
 __all__ = [
-    "FLOAT32_REACH_M",
     "Frame",
     "InputUnits",
     "Translation",
@@ -33,9 +41,6 @@ __all__ = [
     "choose_units",
     "frame_between",
 ]
-
-FLOAT32_REACH_M: Final = 16384.0
-"""Below this, rounding to float32 moves a coordinate by less than half a millimetre."""
 
 _SCAN_POINTS: Final = 1 << 20
 _ROUNDING: Final = 1.001  # bounds in headers are rounded
@@ -180,26 +185,28 @@ def _reach(low: Extremes, high: Extremes, move: tuple[float, float, float]) -> f
     return float(max(np.abs(low + move).max(), np.abs(high + move).max()))
 
 
-def _loss_mm(reach: float) -> float:
-    return float(np.spacing(np.float32(reach))) / 2 * 1e3
+def _loss(reach: float) -> str:
+    """Return the most that float32 loses at a coordinate, in millimetres with two digits."""
+    loss_mm = float(np.spacing(np.float32(reach))) / 2 * 1e3
+    return f"{np.format_float_positional(loss_mm, 2, fractional=False, trim='-')} mm"
 
 
 def _moved_note(move: Sequence[float], reach: float) -> str:
     x, y, z = move
     return (
-        f"moved by ({x:.12g}, {y:.12g}, {z:.12g}) m: float32 would have lost up to {_loss_mm(reach):.2g} mm "
+        f"moved by ({x:.12g}, {y:.12g}, {z:.12g}) m: float32 would have lost up to {_loss(reach)} "
         "where the points were; `shmmap divide --translate none` keeps their frame, in float64"
     )
 
 
 def _kept_note(reach: float) -> str:
     return (
-        f"x, y and z stay float64: float32 would lose up to {_loss_mm(reach):.2g} mm; "
+        f"x, y and z stay float64: float32 would lose up to {_loss(reach)}; "
         "Autoware's loader reads float32 only"
     )
 
 
-_BY_NAME: Final = {"m": METRE, **FEET}
+_BY_NAME: Final = {"m": METRE, **LENGTHS}
 
 
 @dataclass(frozen=True, slots=True)
@@ -255,8 +262,13 @@ def choose_units(sources: Sequence[Source], unit: str, vertical_unit: str) -> In
 def _scale(source: Source, unit: str, vertical_unit: str, notes: list[str]) -> tuple[float, float]:
     crs = source.crs or CoordinateSystem()
     said = crs.units
-    if crs.geographic and unit in FEET:
-        raise refusal("not_metres", "x and y are degrees, which no factor converts", path=source.path)
+    if crs.geographic and unit != "m":
+        raise refusal(
+            "not_metres",
+            GEOGRAPHIC_SYSTEM,
+            path=source.path,
+            hint="no factor converts degrees; --unit m takes the numbers as metres, if the file is wrong",
+        )
     plane = _BY_NAME.get(unit, said[0])
     height = _BY_NAME.get(vertical_unit) or (
         said[1] if vertical_unit == "auto" or unit in ("", "auto") or crs.height is not None else plane
@@ -272,6 +284,8 @@ def _scale(source: Source, unit: str, vertical_unit: str, notes: list[str]) -> t
         raise _not_metres(source.path, plane, height)
     if (plane, height) != (METRE, METRE):
         notes.append(f"converted to metres: {units_text(plane, height)}")
+    elif crs.geographic:
+        notes.append(f"taken as metres, although the file says: {GEOGRAPHIC_SYSTEM}")
     elif said != (METRE, METRE):
         notes.append(f"taken as metres, although the file says: {units_text(*said)}")
     return plane.metres, height.metres

@@ -26,7 +26,7 @@ from xxhash import xxh3_64_hexdigest
 
 from shmmap.errors import BadRequest, CannotWrite, InternalError, MapMissing, error_from_wire
 from shmmap.formats.cloud import READABLE_SUFFIXES
-from shmmap.formats.coordinate_system import FEET
+from shmmap.formats.coordinate_system import LENGTHS
 from shmmap.formats.durable_file import locked_entry, locked_file
 from shmmap.logfmt import log
 from shmmap.origin.catalogue import Catalogue, MapOrigin
@@ -39,7 +39,7 @@ from shmmap.processes.start_child import MAX_PACKET_BYTES, how_ended, start_chil
 
 __all__ = ["DividedCloud", "find_origin"]
 
-_RECIPE: Final = "cells of 20 m, frame moved, 2"  # changes if the same cloud is divided differently
+_RECIPE: Final = "cells of 20 m, frame moved, 3"  # changes if the same cloud is divided differently
 _KEPT_CLOUDS: Final = 8
 _MORE_TIME_USEC: Final = 60_000_000
 _USE_LOCK: Final = ".use"  # shared lock, held by every daemon that serves the cloud
@@ -58,6 +58,7 @@ def find_origin(
     cache_dir: str = "",
     unit: str = "",
     vertical_unit: str = "",
+    drop_noise: bool = False,
     notify: Callable[..., None] = _notify_no_one,
 ) -> MapOrigin:
     """Return the origin of the map at a path: a map, or a cloud that must be divided first.
@@ -68,6 +69,8 @@ def find_origin(
         As in `open_map`; empty ones are searched for, or default to the user's.
     unit, vertical_unit
         Units of a cloud's coordinates, as in `shmmap.dividing.frame.choose_units`.
+    drop_noise
+        Leave out points that a LAS file classifies as noise.
     notify
         Sends ``KEY=value`` lines of progress to the service manager, see `DividedCloud`.
 
@@ -81,11 +84,17 @@ def find_origin(
     path = absolute_path(map_path)
     suffix = os.path.splitext(path)[1].lower()
     is_cloud = os.path.isfile(path) and suffix in READABLE_SUFFIXES and not metadata
-    in_feet = unit in FEET or vertical_unit in FEET
-    if is_cloud and (in_feet or not (suffix == ".pcd" and is_served_whole(path))):
+    converts = unit in LENGTHS or vertical_unit in LENGTHS
+    if is_cloud and (converts or not (suffix == ".pcd" and is_served_whole(path))):
         cache_dir = absolute_path(cache_dir or default_cache_directory())
-        return DividedCloud(path, cache_dir, strict=strict, units=(unit, vertical_unit), notify=notify)
-    if in_feet:
+        how = (unit, vertical_unit, "drop noise" if drop_noise else "")
+        return DividedCloud(path, cache_dir, strict=strict, how=how, notify=notify)
+    if drop_noise:
+        raise BadRequest(
+            f"{path} is no cloud that is divided first: noise is not left out of it",
+            hint="divide its cloud again: shmmap divide --drop-noise",
+        )
+    if converts:
         raise BadRequest(
             f"{path} is a divided map, not a cloud: it is not converted",
             hint="divide its cloud again: shmmap divide --unit",
@@ -104,8 +113,9 @@ class DividedCloud:
         Absolute path of the directory for divided clouds, and for indexes of large maps.
     strict
         As in `open_map`.
-    units
-        Units of the cloud's coordinates, in the plane and in height, as in `find_origin`.
+    how
+        Units of the cloud's coordinates, in the plane and in height, as in `find_origin`, and a word if noise
+        is left out; each may be empty.
     notify
         Sends ``KEY=value`` lines to the service manager.
     """
@@ -116,11 +126,11 @@ class DividedCloud:
         cache_dir: str,
         *,
         strict: bool = False,
-        units: tuple[str, str] = ("", ""),
+        how: tuple[str, str, str] = ("", "", ""),
         notify: Callable[..., None] = _notify_no_one,
     ) -> None:
         self.path = path
-        self._units = units
+        self._how = how
         self._cache_dir = cache_dir
         stem = os.path.basename(path).rpartition(".")[0][:64]
         self._clouds = os.path.join(cache_dir, "divided")
@@ -142,7 +152,7 @@ class DividedCloud:
         except OSError as error:
             raise MapMissing(f"cannot read {self.path}: {error.strerror}") from error
         stamp = (status.st_size, status.st_mtime_ns, status.st_ctime_ns)
-        name = xxh3_64_hexdigest(json.dumps([_RECIPE, *self._units, *stamp]).encode())
+        name = xxh3_64_hexdigest(json.dumps([_RECIPE, *self._how, *stamp]).encode())
         out = os.path.join(self._directory, name)
         link = os.path.join(self._directory, LINK_NAME)
         try:
@@ -171,7 +181,7 @@ class DividedCloud:
     def _divide(self, out: str) -> None:
         log.info("dividing", cloud=self.path, into=out)
         process, channel = start_child(
-            "shmmap.dividing.child_main", self.path, out, *self._units, new_session=False
+            "shmmap.dividing.child_main", self.path, out, *self._how, new_session=False
         )
         failure: dict[str, Any] = {}
         stage = ""

@@ -50,6 +50,8 @@ class DivideSettings:
         Memory limit of the process, including code and libraries.
     common_fields
         Keep only the common fields if the inputs' fields differ.
+    drop_noise
+        Leave out points that LAS classifies as noise (classes 7 and 18).
     fields
         Fields to keep, including x, y and z; empty: all.
     force
@@ -75,6 +77,7 @@ class DivideSettings:
     encoding: str = "binary"
     memory_bytes: int = 1 << 30
     common_fields: bool = False
+    drop_noise: bool = False
     fields: tuple[str, ...] = ()
     force: bool = False
     resume: bool = False

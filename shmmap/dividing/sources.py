@@ -17,6 +17,7 @@ from shmmap.errors import BadRequest, MapDataError
 from shmmap.formats.cloud import cloud_suffix, open_blocks
 from shmmap.formats.coordinate_system import CoordinateSystem
 from shmmap.formats.pcd.reader import PcdReader, expanded_blocks
+from shmmap.formats.point_checks import PointChecks
 from shmmap.formats.source_file import refusal
 
 __all__ = [
@@ -175,6 +176,8 @@ class Source(ABC):
         Metres per unit, in the plane and in height; 1 until set, which must happen before reading.
     warnings
         Oddities of the file.
+    checks
+        What is odd about the points that were read.
     """
 
     claimed_bounds: Bound3 | None = None
@@ -186,6 +189,7 @@ class Source(ABC):
         self.points = points
         self.row = row
         self.warnings = warnings
+        self.checks = PointChecks()
         self._layout = RowLayout(row)
 
     @abstractmethod
@@ -212,7 +216,7 @@ class Source(ABC):
             raise refusal("changed", "the file changed since it was looked at", path=self.path)
 
 
-def open_source(path: str, *, memory_bytes: int, scratch_dir: str) -> Source:
+def open_source(path: str, *, memory_bytes: int, scratch_dir: str, drop_noise: bool = False) -> Source:
     """Open a cloud and check its header.
 
     Parameters
@@ -223,6 +227,8 @@ def open_source(path: str, *, memory_bytes: int, scratch_dir: str) -> Source:
         Memory that reading may take.
     scratch_dir
         Directory in which a compressed PCD file larger than that is expanded, as an unnamed file.
+    drop_noise
+        As in `shmmap.formats.cloud.read_cloud`.
 
     Raises
     ------
@@ -236,7 +242,7 @@ def open_source(path: str, *, memory_bytes: int, scratch_dir: str) -> Source:
             if reader.header.encoding == "binary" and floats:
                 return _BinaryPcd(reader)
             return _StreamedPcd(reader, memory_bytes, scratch_dir)
-    return _OtherFormat(path, suffix)
+    return _OtherFormat(path, suffix, drop_noise=drop_noise)
 
 
 def _open_pcd(path: str) -> PcdReader:
@@ -248,6 +254,7 @@ class _BinaryPcd(Source):
 
     def __init__(self, reader: PcdReader) -> None:
         super().__init__(reader.path, reader.header.points, _row_of_records(reader), reader.warnings)
+        self.crs = reader.header.crs
         self._reader = reader
         self._at = 0
         self._direct = False
@@ -298,6 +305,8 @@ class _Stream(Source):
     def begin(self, layout: RowLayout, start: int) -> None:
         self.close()
         self._layout = layout
+        if not start:  # else the points before were counted by the run that is resumed
+            self.checks.counts.clear()
         self._iterator = self._blocks(start)
         self._used = self._length = 0
 
@@ -313,9 +322,9 @@ class _Stream(Source):
                 self._used, self._length = 0, len(xyz)
             count = min(len(rows) - at, self._length - self._used)
             part = slice(self._used, self._used + count)
-            self._layout.put(
-                {name: values[part] for name, values in self._block.items()}, rows[at : at + count]
-            )
+            columns = {name: values[part] for name, values in self._block.items()}
+            self.checks.add(columns)
+            self._layout.put(columns, rows[at : at + count])
             self._used += count
             at += count
         return at
@@ -331,6 +340,7 @@ class _StreamedPcd(_Stream):
     def __init__(self, reader: PcdReader, memory_bytes: int, scratch_dir: str) -> None:
         header = reader.header
         super().__init__(reader.path, header.points, reader.columns, reader.warnings)
+        self.crs = header.crs
         self._scratch_dir = scratch_dir
         expanded = header.points * header.point_bytes
         packed = os.fstat(reader.fileno()).st_size
@@ -348,15 +358,17 @@ class _StreamedPcd(_Stream):
 class _OtherFormat(_Stream):
     """Source of all formats other than PCD."""
 
-    def __init__(self, path: str, suffix: str) -> None:
+    def __init__(self, path: str, suffix: str, *, drop_noise: bool) -> None:
         self._suffix = suffix
-        with open_blocks(path, suffix) as reader:
+        self._drop_noise = drop_noise
+        with open_blocks(path, suffix, drop_noise=drop_noise) as reader:
             super().__init__(path, reader.points, reader.columns, reader.warnings)
             self.claimed_bounds = reader.bounds
             self.crs = reader.crs
+            self.checks = reader.checks
 
     def _blocks(self, start: int) -> Blocks:
-        with open_blocks(self.path, self._suffix) as reader:
+        with open_blocks(self.path, self._suffix, drop_noise=self._drop_noise) as reader:
             self._check_same(reader.points, _row_of(reader.columns))
             yield from reader.blocks(_READER_BLOCK_POINTS, start)
             self.warnings = reader.warnings

@@ -11,11 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.columns import Bounds, ColumnSpec
-from shmmap.formats.coordinate_system import GEOGRAPHIC_SYSTEM, CoordinateSystem, degrees_warning
+from shmmap.formats.coordinate_system import (
+    GEOGRAPHIC_SYSTEM,
+    CoordinateSystem,
+    degrees_warning,
+    unit_warnings,
+)
 from shmmap.formats.las_reader import LAS_SUFFIXES, LasReader
 from shmmap.formats.pcd.header import IDENTITY_VIEWPOINT
 from shmmap.formats.pcd.reader import PcdReader
 from shmmap.formats.ply_reader import PlyReader
+from shmmap.formats.point_checks import step_warning
 from shmmap.formats.source_file import open_regular, refusal
 from shmmap.formats.text_reader import TABLE_SUFFIXES, TEXT_SUFFIXES, TextReader
 
@@ -64,10 +70,10 @@ def cloud_suffix(path: str | os.PathLike[str]) -> str:
     return suffix
 
 
-def open_blocks(path: str, suffix: str) -> BlockReader:
+def open_blocks(path: str, suffix: str, *, drop_noise: bool = False) -> BlockReader:
     """Open a cloud of a format other than PCD; errors are those of its reader."""
     if suffix in LAS_SUFFIXES:
-        return LasReader(path)
+        return LasReader(path, drop_noise=drop_noise)
     return PlyReader(path) if suffix == ".ply" else TextReader(path)
 
 
@@ -85,7 +91,8 @@ class PointCloud:
     columns
         ``xyz`` (N, 3) in metres, then every other field as (N,) or (N, k), dtypes as in the file.
     points
-        Points in the file; ``dropped`` of them were left out because x, y or z is not finite.
+        Points in the file; ``dropped`` of them were left out because x, y or z is not finite, or because LAS
+        marks them.
     viewpoint
         Translation x y z in metres, then quaternion w x y z; not applied to the points.
     bounds
@@ -116,7 +123,8 @@ class CloudDescription:
     path, format, encoding, version, file_bytes
         The file; ``encoding`` and ``version`` are empty if the format has none.
     points, dropped
-        Points in the file, and how many of them have an x, y or z that is not finite.
+        Points in the file, and how many of them are left out: x, y or z is not finite, or LAS flags them
+        withheld.
     width, height
         Size of an organised cloud; (points, 1) otherwise.
     columns
@@ -168,14 +176,23 @@ def read_pcd(path: str | os.PathLike[str], *, keep_non_finite: bool = False) -> 
             dropped=reader.dropped,
             bounds=reader.bounds,
             viewpoint=reader.header.viewpoint,
-            warnings=reader.warnings,
+            warnings=_warnings(reader.warnings, reader.header.crs, reader.bounds, reader.columns[0]),
         )
 
 
-def read_cloud(path: str | os.PathLike[str], *, keep_non_finite: bool = False) -> PointCloud:
+def read_cloud(
+    path: str | os.PathLike[str], *, keep_non_finite: bool = False, drop_noise: bool = False
+) -> PointCloud:
     """Read a whole cloud of any format: PCD, PLY and text directly, LAS and LAZ through laspy.
 
     Coordinates are in the file's unit; ``warnings`` names the unit if it is not the metre.
+
+    Parameters
+    ----------
+    keep_non_finite
+        Keep points whose x, y or z is not finite; points that are left out for another reason are NaN then.
+    drop_noise
+        Leave out points that LAS classifies as noise (classes 7 and 18), as those that are flagged withheld.
 
     Raises
     ------
@@ -186,9 +203,10 @@ def read_cloud(path: str | os.PathLike[str], *, keep_non_finite: bool = False) -
     if suffix == ".pcd":
         return read_pcd(path, keep_non_finite=keep_non_finite)
     bounds, kept = Bounds(), 0
-    with open_blocks(os.fspath(path), suffix) as reader:
+    with open_blocks(os.fspath(path), suffix, drop_noise=drop_noise) as reader:
         columns = {spec.name: np.empty(_shape(spec, reader.points), spec.dtype) for spec in reader.columns}
         for block in reader.blocks(_BLOCK_POINTS):
+            reader.checks.add(block)
             mask = bounds.add(block["xyz"])
             if mask is not None and not keep_non_finite:
                 block = {name: values[mask] for name, values in block.items()}
@@ -201,8 +219,18 @@ def read_cloud(path: str | os.PathLike[str], *, keep_non_finite: bool = False) -
             points=reader.points,
             dropped=reader.points - kept,
             bounds=bounds.result(),
-            warnings=reader.warnings,
+            warnings=_warnings(
+                (*reader.warnings, *reader.checks.notes()), reader.crs, bounds.result(), reader.columns[0]
+            ),
         )
+
+
+def _warnings(
+    found: tuple[str, ...], crs: CoordinateSystem | None, bounds: tuple[Bound, Bound], xyz: ColumnSpec
+) -> tuple[str, ...]:
+    """Return the warnings of a reader, and those that follow from units, bounds and type of coordinates."""
+    step = step_warning(*bounds, xyz.dtype, crs.units[0].metres if crs is not None else 1.0)
+    return (*found, *unit_warnings(crs), *([step] if step else []))
 
 
 def describe(path: str | os.PathLike[str]) -> CloudDescription:
@@ -240,7 +268,8 @@ def _described(path: str | os.PathLike[str]) -> CloudDescription:
             columns=reader.columns,
             bounds=reader.bounds,
             viewpoint=header.viewpoint,
-            warnings=reader.warnings,
+            warnings=_warnings(reader.warnings, header.crs, reader.bounds, reader.columns[0]),
+            crs=header.crs,
             digest=reader.digest,
         )
 
@@ -249,6 +278,7 @@ def _describe_blocks(path: str, suffix: str) -> CloudDescription:
     bounds, dropped = Bounds(), 0
     with open_blocks(path, suffix) as reader:
         for block in reader.blocks(_BLOCK_POINTS):
+            reader.checks.add(block)
             mask = bounds.add(block["xyz"])
             dropped += 0 if mask is None else int(np.count_nonzero(~mask))
         return CloudDescription(
@@ -263,7 +293,9 @@ def _describe_blocks(path: str, suffix: str) -> CloudDescription:
             height=1,
             columns=reader.columns,
             bounds=bounds.result(),
-            warnings=reader.warnings,
+            warnings=_warnings(
+                (*reader.warnings, *reader.checks.notes()), reader.crs, bounds.result(), reader.columns[0]
+            ),
             crs=reader.crs,
         )
 

@@ -22,6 +22,7 @@ if TYPE_CHECKING:  # the command line parses its options without numpy
 __all__ = [
     "FEET",
     "GEOGRAPHIC_SYSTEM",
+    "LENGTHS",
     "METRE",
     "UNITS",
     "CoordinateSystem",
@@ -49,7 +50,15 @@ FEET: Final = {
 }
 """Feet by the names that options use; the two differ by 2 mm in a kilometre."""
 
-UNITS: Final = ("auto", "m", *FEET)
+LENGTHS: Final = {
+    "mm": LengthUnit("millimetre", 0.001),
+    "cm": LengthUnit("centimetre", 0.01),
+    "in": LengthUnit("inch", 0.0254),
+    **FEET,
+}
+"""Units other than metres by the names that options use."""
+
+UNITS: Final = ("auto", "m", *LENGTHS)
 """Values of options for units; ``auto``: the unit that each file names."""
 
 _SAME: Final = 5e-8  # metres; lengths in files are rounded, and the two feet differ by 6e-7
@@ -245,8 +254,8 @@ _UNIT_CODES: Final = {
     9036: LengthUnit("kilometre", 1000.0),
     9093: LengthUnit("statute mile", 1609.344),
     9095: LengthUnit("British foot", 0.3048007491),
-    1025: LengthUnit("millimetre", 0.001),
-    1033: LengthUnit("centimetre", 0.01),
+    1025: LENGTHS["mm"],
+    1033: LENGTHS["cm"],
 }
 # US state planes, whose unit follows from the code: NAD27, NAD83, NAD83(HARN)
 _STATE_PLANES: Final = (range(2222, 2290), range(2867, 2931), range(32001, 32059))
@@ -368,4 +377,5 @@ def unit_text(unit: LengthUnit) -> str:
     if unit == METRE:
         return "metres"
     name = re.sub(r"\bfoot\b", "feet", unit.name)
+    name = re.sub(r"(metre|yard|mile)$", r"\1s", re.sub(r"\binch$", "inches", name))
     return f"{name} ({unit.metres:.12g} m)" if unit.metres else f"{name} (of a length not known)"

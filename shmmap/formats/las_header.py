@@ -2,7 +2,7 @@
 """Read and check the header of a LAS or LAZ file: counts against its size, scales, coordinate system.
 
 The format is that of the ASPRS LAS specification 1.4 R15.  The header is checked here because laspy trusts it
-and allocates memory for what it claims.
+and allocates memory for what it claims.  laspy gets a header with the records that points need, no others.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import IO, Final
 
 from shmmap.errors import MapDataError
 from shmmap.formats.coordinate_system import CoordinateSystem, geokey_system, wkt_system
+from shmmap.formats.laz_chunks import standard_bytes
 from shmmap.formats.source_file import open_regular, refusal
 
 __all__ = ["LasHeader", "read_las_header"]
@@ -36,8 +37,16 @@ _EXTENDED: Final = struct.Struct("<2x16sHQ32x")
 _PROJECTION: Final = b"LASF_Projection"
 _WKT, _GEOKEYS, _GEODOUBLES, _GEOTEXTS = 2112, 34735, 34736, 34737
 _LASZIP: Final = (b"laszip encoded", 22204)
+_EXTRA_BYTES: Final = (b"LASF_Spec", 4)
+_DIMENSION_BYTES: Final = 192  # one dimension in the Extra Bytes record
+_TYPE_BYTES: Final = (1, 1, 2, 2, 4, 4, 8, 8, 4, 8)  # of types 1 to 10; 11 to 20 are pairs, 21 to 30 triples
 _MAX_RECORDS: Final = 10_000
 _MAX_RECORD_BYTES: Final = 1 << 20
+_MAX_CHUNKS: Final = (
+    1 << 17
+)  # in any file; and one more for each of these bytes, which hold thousands of points
+_CHUNK_BYTES: Final = 1 << 14
+_SHOWN: Final = 8  # names in a warning
 _VARIABLE_CHUNKS: Final = 0xFFFFFFFF
 _LEGACY_FORMATS: Final = 6  # point formats below this have the legacy count, too
 
@@ -58,6 +67,8 @@ class LasHeader:
         Format and size of an uncompressed point.
     data_at
         Byte offset of the points.
+    head
+        A header for laspy: the file's, with the LASzip and the Extra Bytes record only.
     crs
         The coordinate system; None if the file names none.
     warnings
@@ -70,6 +81,7 @@ class LasHeader:
     point_format: int
     record_bytes: int
     data_at: int
+    head: bytes
     crs: CoordinateSystem | None
     warnings: list[str]
 
@@ -114,6 +126,8 @@ class _Header:
         long: int | None = None
         if head[25] >= 4 and len(head) >= _LONG_AT + 8:
             waveforms, extended_at, extended, long = _LONG.unpack_from(head, 227)
+        if header_bytes < _SHORTEST_BYTES:
+            raise self._error("bad_las", f"a header of {header_bytes} bytes announced", 94)
         self._check_scales()
         points = self._count(legacy, long, form)
         compressed = bool(form & _LAZ_BIT)
@@ -125,21 +139,26 @@ class _Header:
                 f"{points} points announced need {needed} bytes, {self.size} are there",
                 self.size,
             )
-        for what, first, count, end, form_of in (
-            ("records", header_bytes, records, data_at, _RECORD),
-            ("extended records", extended_at, extended, self.size, _EXTENDED),
-        ):
-            room = max(0, end - first)
-            if count * form_of.size > room:  # laspy would search for each of them
-                raise self._error(
-                    "bad_las", f"{count} {what} announced in {room} bytes", min(first, self.size)
-                )
+        room = max(0, data_at - header_bytes)
+        if records * _RECORD.size > room:
+            message = f"{records} records announced in {room} bytes"
+            raise self._error("bad_las", message, min(header_bytes, self.size))
+        room = max(0, self.size - extended_at) if extended_at >= data_at else 0
+        if extended * _EXTENDED.size > room:
+            self.warnings.append(
+                f"{extended} extended records announced at byte {extended_at}, where there is room for"
+                f" {room // _EXTENDED.size}"
+            )
+            extended = room // _EXTENDED.size
         found = dict(self._records(header_bytes, records, extended_at, extended))
         if compressed:
             self._check_chunks(points, data_at, found.get(_LASZIP, b""))
         else:
-            behind = [at for at in (waveforms, extended_at if extended else 0) if at >= needed]
-            self._check_rest(points, needed, min(behind, default=self.size), record_bytes)
+            behind = (waveforms, extended_at if extended else 0)
+            rest_end = min((at for at in behind if needed <= at <= self.size), default=self.size)
+            self._check_rest(points, needed, rest_end, record_bytes)
+        needs = {_LASZIP: found.get(_LASZIP, b"")}
+        needs[_EXTRA_BYTES] = self._dimensions(found.get(_EXTRA_BYTES, b""), form & 0x3F, record_bytes)
         return LasHeader(
             points=points,
             compressed=compressed,
@@ -147,6 +166,7 @@ class _Header:
             point_format=form & 0x3F,
             record_bytes=record_bytes,
             data_at=data_at,
+            head=self._head_with(header_bytes, {key: text for key, text in needs.items() if text}),
             crs=self._system(found),
             warnings=self.warnings,
         )
@@ -205,8 +225,9 @@ class _Header:
             return
         self.file.seek(table_at + 4)
         chunks = int.from_bytes(self.file.read(4), "little")
-        if chunks > table_at - data_at:
-            raise self._error("bad_las", f"{chunks} chunks in {table_at - data_at} bytes", table_at + 4)
+        room = table_at - data_at
+        if chunks > min(room, _MAX_CHUNKS + room // _CHUNK_BYTES):  # lazrs makes a list of them
+            raise self._error("bad_las", f"{chunks} chunks announced in {room} bytes", table_at + 4)
         if chunk_points in (0, _VARIABLE_CHUNKS):
             if chunks and not points:
                 raise self._error(
@@ -240,12 +261,43 @@ class _Header:
                     return
                 user, number, length = form.unpack(head)
                 key = user.rstrip(b"\0"), number
-                if key == _LASZIP or (key[0] == _PROJECTION and length <= _MAX_RECORD_BYTES):
+                if key in (_LASZIP, _EXTRA_BYTES) or key[0] == _PROJECTION:
                     yield key, self.file.read(min(length, _MAX_RECORD_BYTES))
                 at += form.size + length
                 if at > self.size:
                     self.warnings.append(f"a record ends at byte {at}, behind the file's end")
                     return
+
+    def _dimensions(self, described: bytes, point_format: int, record_bytes: int) -> bytes:
+        """Return the part of an Extra Bytes record whose dimensions the points have; note the others."""
+        room = record_bytes - standard_bytes(point_format)
+        used, names, end = 0, [], 0
+        for at in range(0, len(described) - _DIMENSION_BYTES + 1, _DIMENSION_BYTES):
+            kind, size = described[at + 2 : at + 4]
+            if 1 <= kind <= 30:
+                size = _TYPE_BYTES[(kind - 1) % 10] * (1 + (kind - 1) // 10)
+            used += size
+            if used > room:
+                names.append(described[at + 4 : at + 36].split(b"\0")[0].decode("utf-8", "replace"))
+            else:
+                end = at + _DIMENSION_BYTES
+        if names:
+            self.warnings.append(
+                f"its Extra Bytes record describes {used} bytes, its points have {max(0, room)}: without"
+                f" {', '.join(map(repr, names[:_SHOWN]))}" + (", ..." if len(names) > _SHOWN else "")
+            )
+        return described[:end]
+
+    def _head_with(self, header_bytes: int, records: dict[tuple[bytes, int], bytes]) -> bytes:
+        """Return the header with these records and no others."""
+        self.file.seek(0)
+        head = bytearray(self.file.read(header_bytes))
+        if self.head[25] >= 4 and len(head) >= _LONG_AT + 8:
+            struct.pack_into("<QI", head, _LONG_AT - 12, 0, 0)
+        for (user, number), text in records.items():
+            head += _RECORD.pack(user, number, len(text)) + text
+        struct.pack_into("<II", head, 96, len(head), len(records))
+        return bytes(head)
 
     def _system(self, found: dict[tuple[bytes, int], bytes]) -> CoordinateSystem | None:
         """Return the file's coordinate system, from WKT or GeoTIFF keys as the header's flag selects."""

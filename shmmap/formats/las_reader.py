@@ -4,25 +4,27 @@
 The format is that of the ASPRS LAS specification 1.4 R15; COPC is LAZ with its points in the order
 of an octree.  Coordinates are stored as scaled integers and come out as float64.  Every dimension
 becomes a column: bit fields such as ``return_number`` one byte each, extra dimensions with their
-scale applied.
+scale applied.  Points that are flagged withheld have no place (NaN), so that all that reads them leaves them
+out, as it does with points that are not finite.
 """
 
 from __future__ import annotations
 
+import io
 import os
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from types import TracebackType
-from typing import Any, Final
+from typing import IO, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.columns import ColumnSpec, column_names
 from shmmap.errors import MapDataError, PackageMissing
-from shmmap.formats.coordinate_system import unit_warnings
-from shmmap.formats.las_header import read_las_header
+from shmmap.formats.las_header import LasHeader, read_las_header
 from shmmap.formats.laz_chunks import check_laz
+from shmmap.formats.point_checks import LasChecks, las_left_out
 from shmmap.formats.source_file import refusal
 
 __all__ = ["LAS_SUFFIXES", "LasReader"]
@@ -36,6 +38,11 @@ Bound3 = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 class LasReader:
     """A LAS or LAZ file, opened and its header checked.
+
+    Parameters
+    ----------
+    drop_noise
+        Whether points of the classes 7 and 18 have no place, either.
 
     Attributes
     ----------
@@ -54,6 +61,8 @@ class LasReader:
         Version of the LAS format, such as ``1.4``.
     warnings
         Oddities of the file.
+    checks
+        Counts of points that are marked; what reads points adds them.
 
     Raises
     ------
@@ -63,8 +72,10 @@ class LasReader:
         laspy is not installed.
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
+    def __init__(self, path: str | os.PathLike[str], *, drop_noise: bool = False) -> None:
         self.path = os.fspath(path)
+        self._drop_noise = drop_noise
+        self.checks = LasChecks(drop_noise=drop_noise)
         checked = read_las_header(self.path)
         self.points = checked.points
         self.compressed = checked.compressed
@@ -93,14 +104,17 @@ class LasReader:
                 checked.warnings.append(
                     f"the header counts {self.points} points, the compressed data {counted}"
                 )
-            self._reader = laspy.open(undo.enter_context(open(self.path, "rb")), **backends)
-            self._read_header(laspy, checked.points)
+            source = _Source(checked.head, undo.enter_context(open(self.path, "rb")))
+            self._reader = laspy.LasReader(source, **backends)
+            source.to_points(checked.data_at)
+            self._read_header(laspy, checked)
             undo.pop_all()
-        self.warnings: tuple[str, ...] = (*checked.warnings, *unit_warnings(checked.crs))
+        self.warnings: tuple[str, ...] = tuple(checked.warnings)
 
-    def _read_header(self, laspy: Any, points: int) -> None:
+    def _read_header(self, laspy: Any, checked: LasHeader) -> None:
         header = self._reader.header
-        header.point_count = points  # laspy trusts a wide count of 0
+        header.offset_to_point_data = checked.data_at
+        header.point_count = checked.points  # laspy trusts a wide count of 0
         self.version = str(header.version)
         self.encoding = ""
         low, high = np.array(header.mins, np.float64), np.array(header.maxs, np.float64)
@@ -160,7 +174,26 @@ class LasReader:
         block: dict[str, NDArray[Any]] = {"xyz": xyz}
         for column, name in zip(self._columns, self._names, strict=True):
             block[column] = np.asarray(record[name])
+        left_out = las_left_out(block, drop_noise=self._drop_noise)
+        if left_out.any():
+            xyz[left_out] = np.nan
         return block
+
+
+class _Source:
+    """A file for laspy, which reads a header from memory first, and then the file."""
+
+    def __init__(self, head: bytes, file: IO[bytes]) -> None:
+        self._file = file
+        self._read_from: IO[bytes] = io.BytesIO(head)
+
+    def to_points(self, data_at: int) -> None:
+        """Continue in the file, at its points."""
+        self._file.seek(data_at)
+        self._read_from = self._file
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._read_from, name)
 
 
 @contextmanager

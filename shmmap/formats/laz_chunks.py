@@ -17,7 +17,7 @@ from typing import IO, Final
 from shmmap.errors import MapDataError
 from shmmap.formats.source_file import refusal
 
-__all__ = ["LazChunks", "check_laz"]
+__all__ = ["LazChunks", "check_laz", "standard_bytes"]
 
 _RECORD: Final = struct.Struct("<H10xI16xH")  # compressor, points per chunk, items
 _ITEM: Final = struct.Struct("<HHH")  # type, bytes, version
@@ -51,6 +51,11 @@ _BYTES: Final = {
 }
 _LAYERS: Final = {_POINT14: 9, _RGB14: 1, _RGBNIR14: 2, _WAVE14: 1}
 _WHOLE_CHUNK_BYTES: Final = 256 << 20  # bytes of one chunk's points, held at once
+
+
+def standard_bytes(point_format: int) -> int:
+    """Return the bytes of a point without extra bytes; 0 for a format that LAS does not have."""
+    return sum(_BYTES[kind] for kind in _ITEMS.get(point_format, ()))
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +133,7 @@ def check_laz(
 def _check_items(path: str, items: list[tuple[int, int, int]], point_format: int, record_bytes: int) -> None:
     """Check the items of a compressed point against the point format in the header."""
     needed = _ITEMS.get(point_format, ())
-    extra = record_bytes - sum(_BYTES[kind] for kind in needed)
+    extra = record_bytes - standard_bytes(point_format)
     expected = [(kind, _BYTES[kind]) for kind in needed]
     if extra:
         expected.append((_EXTRA14 if needed[:1] == (_POINT14,) else _EXTRA, extra))

@@ -16,8 +16,10 @@ import numpy as np
 
 from shmmap.columns import column_names
 from shmmap.errors import BadRequest, MapDataError
+from shmmap.formats.coordinate_system import CoordinateSystem
 from shmmap.formats.pcd.fields import AXES, MAX_FIELDS, PcdField
 from shmmap.formats.source_file import refusal
+from shmmap.formats.stated_units import decoded, system_of_comments
 
 __all__ = ["HEADER_LIMIT_BYTES", "PlyElement", "PlyHeader", "PlyProperty", "parse_ply_header", "ply_header"]
 
@@ -94,6 +96,8 @@ class PlyHeader:
         Whether lines end in CR alone.
     warnings
         Oddities that did not prevent reading.
+    crs
+        Units that comments state; None if they state none.
     """
 
     format: str
@@ -104,6 +108,7 @@ class PlyHeader:
     data_offset: int
     bare_cr: bool
     warnings: tuple[str, ...]
+    crs: CoordinateSystem | None = None
 
 
 def parse_ply_header(head: bytes, *, path: str, file_bytes: int) -> PlyHeader:
@@ -137,6 +142,7 @@ class _Parser:
         self.form = ""
         self.elements: list[PlyElement] = []
         self.warnings: list[str] = []
+        self.comments: list[str] = []
 
     def parse(self) -> PlyHeader:
         start, bare_cr = self._magic()
@@ -157,6 +163,7 @@ class _Parser:
             data_offset=data_offset,
             bare_cr=bare_cr,
             warnings=tuple(self.warnings),
+            crs=system_of_comments(self.comments),
         )
         self._check_size(header)
         return header
@@ -196,7 +203,10 @@ class _Parser:
             at = end + 1
             if words == [b"end_header"]:
                 return at
-            if not words or words[0] in (b"comment", b"obj_info"):
+            if not words:
+                continue
+            if words[0] in (b"comment", b"obj_info"):
+                self.comments.append(decoded(b" ".join(words[1:])))
                 continue
             try:
                 self._line([word.decode("ascii") for word in words])

@@ -21,6 +21,7 @@ from shmmap.formats.coordinate_system import CoordinateSystem
 from shmmap.formats.pcd.body import record_blocks
 from shmmap.formats.pcd.fields import FieldTable
 from shmmap.formats.ply_header import HEADER_LIMIT_BYTES, PlyElement, PlyHeader, parse_ply_header
+from shmmap.formats.point_checks import PointChecks
 from shmmap.formats.source_file import FileReader, refusal
 from shmmap.formats.text_rows import RowParser
 
@@ -67,7 +68,8 @@ class PlyReader(FileReader):
         super().__init__(path)
         self._table = FieldTable(self._header.fields)
         self._oddities: list[str] = []
-        self.crs: CoordinateSystem | None = None
+        self.checks = PointChecks()
+        self.crs: CoordinateSystem | None = self._header.crs
         self.bounds: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
         self.version = ""
         self.points = self._header.vertex.count

@@ -2,9 +2,9 @@
 """Read plain text clouds, one point a line: XYZ variants, PTS, and tables with named columns (TXT, CSV, ASC).
 
 Values are separated by white space, commas or semicolons.  Columns are named by a header, a comment or the
-first line (``//X Y Z I R G B``, ``# x y z intensity``, ``x,y,z,ring``).  Without names x, y and z are the
-first three, the others are guessed from their number, and a warning reports the guess.  All values are
-float64.
+first line (``//X Y Z I R G B``, ``# x y z intensity``, ``x [mm],y [mm],z [mm],ring``), which may state units,
+as may comments (``# units: mm``).  Without names x, y and z are the first three, the others are guessed from
+their number, and a warning reports the guess.  All values are float64.
 """
 
 from __future__ import annotations
@@ -20,9 +20,17 @@ from numpy.typing import NDArray
 
 from shmmap.columns import ColumnSpec, column_names
 from shmmap.errors import MapDataError
-from shmmap.formats.coordinate_system import CoordinateSystem
+from shmmap.formats.coordinate_system import CoordinateSystem, LengthUnit
 from shmmap.formats.pcd.fields import AXES, MAX_FIELDS, FieldTable, PcdField
+from shmmap.formats.point_checks import NAME_THEM, TextChecks
 from shmmap.formats.source_file import FileReader, refusal
+from shmmap.formats.stated_units import (
+    coordinates_of,
+    decoded,
+    system_of_comments,
+    units_in_comments,
+    units_row,
+)
 from shmmap.formats.text_rows import NUMBER, RowParser, line_ends, whole_lines
 
 __all__ = ["TABLE_SUFFIXES", "TEXT_SUFFIXES", "TextReader"]
@@ -34,13 +42,14 @@ TABLE_SUFFIXES: Final = (".txt", ".csv", ".asc")
 _HEAD_BYTES: Final = 1 << 16  # the first point must begin within this
 _COMMENT: Final = re.compile(rb"(?m)^[ \t]*(?:#|//|%)[^\r\n]*")
 _NO_ROW: Final = re.compile(rb"(?m)^[ \t\r\v\f]*(?:$|#|//|%)")
-_UNIT: Final = re.compile(r"[\[(].*")
+_UNIT: Final = re.compile(r"\s*[\[({<][^\[\](){}<>]*[\])}>]")
 _NORMALS: Final = ("nx", "ny", "nz")
 _COLOURS: Final = ("red", "green", "blue")
 _UNNAMED: Final = {1: ("intensity",), 3: _COLOURS, 4: ("intensity", *_COLOURS)}
 """Names of the columns after x, y and z, by their number, as in PTS files."""
 _NORMAL_LENGTHS: Final = (0.99, 1.01)
-_LOOKED_AT: Final = 32  # rows to look at
+_LOOKED_AT: Final = 1024  # rows to look at
+_LOOKED_AT_NORMALS: Final = 32
 _SHOWN: Final = 60
 
 
@@ -48,7 +57,8 @@ _SHOWN: Final = 60
 class _Layout:
     """The layout of a file, found from its first lines.
 
-    ``names`` are the columns' names, including x, y and z; ``separator`` is empty for white space.
+    ``names`` are the columns' names, including x, y and z; ``separator`` is empty for white space; ``crs``
+    has the units that the file states.
     """
 
     names: list[str]
@@ -56,7 +66,9 @@ class _Layout:
     separator: bytes = b""
     trailing: bool = False
     announced: int | None = None
-    guess: str = ""
+    crs: CoordinateSystem | None = None
+    warnings: tuple[str, ...] = ()
+    guessed: bool = False
 
 
 class TextReader(FileReader):
@@ -68,23 +80,28 @@ class TextReader(FileReader):
         Lines with a point.
     columns
         ``xyz`` first, then every other column of the file, in its order; float64.
+    crs
+        Units that the file states; None if it states none.
     warnings
         Oddities of the file.
+    checks
+        What is odd about the points; what reads points adds them.
 
     Raises
     ------
     MapDataError
-        ``bad_row``, ``no_xyz``, ``bad_header``, ``truncated`` and the causes of files that cannot be opened,
-        with the byte offset and, for a row, its line.
+        ``bad_row``, ``no_xyz``, ``bad_header``, ``not_metres``, ``truncated`` and the causes of files that
+        cannot be opened, with the byte offset and, for a row, its line.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         super().__init__(path)
         self.columns: tuple[ColumnSpec, ...] = self._table.columns
-        self.crs: CoordinateSystem | None = None
+        self.crs: CoordinateSystem | None = self._layout.crs
         self.bounds: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
         self.encoding = self.version = ""
-        self.warnings: tuple[str, ...] = (self._layout.guess,) if self._layout.guess else ()
+        self.warnings: tuple[str, ...] = self._layout.warnings
+        self.checks = TextChecks(guessed=self._layout.guessed)
 
     def _read_header(self) -> None:
         head = self._source.peek(min(self._source.size, _HEAD_BYTES))
@@ -177,6 +194,7 @@ class _Lines:
         self.path = path
         self.suffix = suffix
         self.file_bytes = file_bytes
+        self.whole = file_bytes <= len(head)
 
     def layout(self) -> _Layout:
         """Return the file's layout."""
@@ -185,7 +203,7 @@ class _Lines:
         if self.head.startswith((b"\xff\xfe", b"\xfe\xff")):
             raise self._error("bad_row", "UTF-16 text is not read: save it as UTF-8 or ASCII", 0)
         at = 3 if self.head.startswith(b"\xef\xbb\xbf") else 0
-        named, named_at = b"", 0
+        named, named_at, units = b"", 0, b""
         comments: list[bytes] = []
         announced: int | None = None
         for line in self.head[at:].split(b"\n"):
@@ -198,6 +216,9 @@ class _Lines:
                 continue
             words = re.split(rb"[\s,;]+", text.strip(b",;"))
             if not all(map(NUMBER.match, words)):
+                if named and not units and units_row(re.split(r"[\s,;]+", decoded(text))):
+                    units = text
+                    continue
                 if named or NUMBER.match(words[0]):
                     raise self._error("bad_row", f"{_shown(text)} is not a row of numbers", start)
                 named, named_at = text, start
@@ -209,7 +230,9 @@ class _Lines:
                 raise self._error("bad_header", "the first line is not the number of points", start)
             layout = self._of_row(text, start)
             layout.announced = announced
-            self._name(layout, comments, named, named_at)
+            self._name(
+                layout, [decoded(comment) for comment in comments], decoded(named), named_at, decoded(units)
+            )
             return layout
         if self.file_bytes > len(self.head):
             raise self._error("bad_row", f"no row of numbers within {len(self.head)} bytes", 0)
@@ -245,62 +268,105 @@ class _Lines:
             )
         return _Layout([""] * len(words), start, separator, trailing)
 
-    def _name(self, layout: _Layout, comments: list[bytes], named: bytes, named_at: int) -> None:
+    def _name(self, layout: _Layout, comments: list[str], named: str, named_at: int, units: str) -> None:
         """Name the columns: from the line before the rows, a comment, or their number."""
-        count = len(layout.names)
+        count, separator = len(layout.names), layout.separator.decode()
+        stated = units_in_comments(comments)
+        lines_of_units = ([units] if units else []) + comments
         for text in (named, *comments[::-1]):
-            if text and (names := _header_names(text, layout.separator, count)):
-                layout.names = names
+            for words in _splits(text, separator, count):
+                row = next((row for line in lines_of_units if (row := _units(line, separator, count))), ())
+                found = coordinates_of(words, row, stated)
+                if found is None:
+                    continue
+                if found.problem:
+                    raise self._error("not_metres", found.problem, named_at)
+                layout.names = [_bare(word) for word in words]
+                for axis, place in zip(AXES, found.places, strict=True):
+                    layout.names[place] = axis
+                layout.crs, layout.warnings = found.crs, found.notes
                 return
         if named:
             raise self._error(
                 "bad_header",
-                f"{_shown(named)} names no {count} columns, x, y and z once each",
+                f"{_shown(named.encode())} names no {count} columns, x, y and z once each",
                 named_at,
-                hint="name the coordinates x, y and z, or leave the line out",
+                hint="name the coordinates x, y and z, each once, and every other column",
             )
+        layout.crs = system_of_comments(comments)
         others = count - 3
+        layout.guessed = True
+        rows = self._first_rows(layout)
+        warnings = []
         names_of_others: Sequence[str] = _UNNAMED.get(others, ())
-        if others == 3 and (self.suffix == ".xyzn" or self._normals(layout)):
+        if others == 3 and (self.suffix == ".xyzn" or (self.suffix != ".xyzrgb" and _are_normals(rows))):
             names_of_others = _NORMALS
+        elif names_of_others[-3:] == _COLOURS and not self._are_colours(rows[:, -3:]):
+            names_of_others = ()
+            warnings.append(f"columns {count - 2} to {count} are no colours, which are integers of 0 to 255")
+            if len(rows) > 1 and _are_bytes(rows[:, :3]):
+                raise self._error(
+                    "bad_row",
+                    "columns 1 to 3 look like a colour (integers of 0 to 255), the last three do not",
+                    layout.data_at,
+                    hint=f"no header says which columns are coordinates: {NAME_THEM}",
+                )
+        if others and len(rows) > 2 and (np.diff(rows[:, 0]) == 1).all() and (rows[:, 0] % 1 == 0).all():
+            warnings.append(f"the first column counts the rows: if it is no coordinate, {NAME_THEM}")
         if not names_of_others:
             names_of_others = [f"column_{place}" for place in range(4, count + 1)]
         layout.names = [*AXES, *names_of_others]
         if others and not (others == 3 and self.suffix in (".xyzn", ".xyzrgb")):
             taken = ", ".join(names_of_others)
-            layout.guess = f"no header names the columns: after x, y and z they are taken as {taken}"
+            warnings.insert(0, f"no header names the columns: after x, y and z they are taken as {taken}")
+        layout.warnings = tuple(warnings)
 
-    def _normals(self, layout: _Layout) -> bool:
-        """Whether columns 4 to 6 of the first rows are unit vectors, not all along an axis."""
-        if self.suffix == ".xyzrgb":
-            return False
-        vectors = []
-        for line in self.head[layout.data_at :].split(b"\n")[:-1][:_LOOKED_AT]:
-            words = line.replace(layout.separator or b" ", b" ").split()[3:6]
-            if len(words) == 3 and all(map(NUMBER.match, words)):
-                vectors.append([float(word) for word in words])
-        if not vectors or not any(0 < abs(value) < 1 for value in vectors[0]):
-            return False
-        lengths = np.linalg.norm(np.array(vectors), axis=1)
-        return bool((lengths > _NORMAL_LENGTHS[0]).all() and (lengths < _NORMAL_LENGTHS[1]).all())
+    def _first_rows(self, layout: _Layout) -> NDArray[np.float64]:
+        """Return the first rows, (N, columns), as far as they are whole and numbers."""
+        count, rows = len(layout.names), []
+        for line in self.head[layout.data_at :].split(b"\n")[: None if self.whole else -1][:_LOOKED_AT]:
+            words = line.replace(layout.separator or b" ", b" ").split()
+            if len(words) == count and all(map(NUMBER.match, words)):
+                rows.append([float(word) for word in words])
+        return np.array(rows, np.float64).reshape(-1, count)
+
+    def _are_colours(self, values: NDArray[np.float64]) -> bool:
+        """Whether three columns can be a colour; in a file that says so by its name, up to 1, too."""
+        floats = self.suffix == ".xyzrgb" and ((values >= 0) & (values <= 1)).all()
+        return bool(floats) or _are_bytes(values)
 
 
-def _header_names(text: bytes, separator: bytes, count: int) -> list[str]:
-    """Return ``count`` names from a header, including x, y and z; none if it does not name them."""
-    plain = text.decode("utf-8", "replace").strip()
-    mark = separator.decode()
-    words = plain.split(mark) if mark and mark in plain else re.split(r"[\s,;]+", plain)
-    if len(words) == count + 1 and not words[-1].strip():
-        words.pop()
-    names = [word.strip().strip("\"'").strip() for word in words]
-    if len(names) != count:
-        return []
-    for axis in AXES:
-        bare = [_UNIT.sub("", name).strip().lower() for name in names]
-        if bare.count(axis) != 1:
-            return []
-        names[bare.index(axis)] = axis
-    return names
+def _are_bytes(values: NDArray[np.float64]) -> bool:
+    return bool(((values >= 0) & (values <= 255) & (values % 1 == 0)).all())
+
+
+def _are_normals(rows: NDArray[np.float64]) -> bool:
+    """Whether columns 4 to 6 of the first rows are unit vectors, not all along an axis."""
+    vectors = rows[:_LOOKED_AT_NORMALS, 3:6]
+    if not len(vectors) or not any(0 < abs(value) < 1 for value in vectors[0]):
+        return False
+    lengths = np.linalg.norm(vectors, axis=1)
+    return bool((lengths > _NORMAL_LENGTHS[0]).all() and (lengths < _NORMAL_LENGTHS[1]).all())
+
+
+def _splits(text: str, separator: str, count: int) -> Iterator[list[str]]:
+    """Yield the ways to split a line into ``count`` names; units in brackets may have spaces around them."""
+    marks = [mark for mark in dict.fromkeys((separator, "\t", ",", ";")) if mark and mark in text]
+    joined = _UNIT.sub(lambda found: re.sub(r"[\s,;]+", "", found.group()), text)
+    for words in (*(text.split(mark) for mark in marks), re.split(r"[\s,;]+", joined.strip())):
+        if len(words) == count + 1 and not words[-1].strip():
+            words.pop()
+        if len(words) == count:
+            yield words
+
+
+def _units(text: str, separator: str, count: int) -> list[LengthUnit | None] | None:
+    """Return the units of ``count`` columns if a line has nothing but units."""
+    return next(filter(None, map(units_row, _splits(text, separator, count))), None)
+
+
+def _bare(word: str) -> str:
+    return word.strip().strip("\"'").strip()
 
 
 def _shown(line: bytes) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 
 from shmmap.errors import MapDataError, MapMissing
 from shmmap.formats.cloud import cloud_suffix
-from shmmap.formats.coordinate_system import degrees_warning
+from shmmap.formats.coordinate_system import degrees_warning, unit_warnings
 from shmmap.formats.pcd.reader import PcdReader
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.catalogue_bytes import (
@@ -245,12 +245,13 @@ _MAX_POINT_BYTES = 4 * MAX_SINGLE_PCD_BYTES
 
 
 def is_served_whole(path: str) -> bool:
-    """Whether the PCD file at ``path`` is small enough to be one cell; True for a damaged file, too."""
+    """Whether the PCD file at ``path`` can be one cell: small, in metres; True for a damaged file, too."""
     try:
         if os.stat(path).st_size > MAX_SINGLE_PCD_BYTES:
             return False
         with PcdReader(path) as reader:
-            return reader.header.points * reader.header.point_bytes <= _MAX_POINT_BYTES
+            header = reader.header
+            return not unit_warnings(header.crs) and header.points * header.point_bytes <= _MAX_POINT_BYTES
     except (OSError, MapDataError):
         return True  # loading it reports what is wrong
 

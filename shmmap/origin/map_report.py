@@ -128,7 +128,7 @@ class DividedMap:
     cells, points
         Number of cell files, and of points in them.
     points_read, dropped
-        Number of points in the inputs, and of those dropped because they are not finite.
+        Number of points in the inputs, and of those left out: not finite, or marked so by LAS.
     origin
         Origin of the map frame in the frame of the inputs, metres: adding it to a point of the map gives
         the point of the input.

@@ -14,8 +14,10 @@ import re
 from dataclasses import dataclass
 from typing import Final, NoReturn
 
+from shmmap.formats.coordinate_system import CoordinateSystem
 from shmmap.formats.pcd.fields import FieldProblem, FieldTable, PcdField, parse_fields
 from shmmap.formats.source_file import refusal
+from shmmap.formats.stated_units import decoded, system_of_comments
 
 __all__ = ["ENCODINGS", "HEADER_LIMIT_BYTES", "IDENTITY_VIEWPOINT", "PcdHeader", "parse_header"]
 
@@ -53,6 +55,8 @@ class PcdHeader:
         Byte offset of the first byte after the DATA line.
     warnings
         Oddities that did not prevent reading.
+    crs
+        Units that comments state; None if they state none.
     """
 
     table: FieldTable
@@ -64,6 +68,7 @@ class PcdHeader:
     version: str
     data_offset: int
     warnings: tuple[str, ...]
+    crs: CoordinateSystem | None = None
 
     @property
     def fields(self) -> tuple[PcdField, ...]:
@@ -100,7 +105,7 @@ def parse_header(head: bytes, *, path: str, file_bytes: int) -> PcdHeader:
     known = _seen.get(plain.group(*_SHARED))
     if known is None:
         header = _parse_any(head, path, file_bytes)
-        if not header.warnings:
+        if not header.warnings and header.crs is None:
             if len(_seen) >= _SEEN_LIMIT:
                 _seen.clear()
             _seen[plain.group(*_SHARED)] = header
@@ -126,7 +131,8 @@ def parse_header(head: bytes, *, path: str, file_bytes: int) -> PcdHeader:
 # Headers of a map's cells differ only in their numbers of points.  So a header as PCL writes it
 # is compared with the common parts of one that was parsed before.
 _PLAIN: Final = re.compile(
-    rb"(?:#[^\n]*\n)?VERSION (?P<version>[^\n]*)\nFIELDS (?P<fields>[^\n]*)\nSIZE (?P<size>[^\n]*)\n"
+    rb"(?:# \.PCD v[0-9.]+ - Point Cloud Data file format\n)?"  # another comment may state units
+    rb"VERSION (?P<version>[^\n]*)\nFIELDS (?P<fields>[^\n]*)\nSIZE (?P<size>[^\n]*)\n"
     rb"TYPE (?P<type>[^\n]*)\nCOUNT (?P<count>[^\n]*)\nWIDTH (?P<width>[0-9]{1,10})\n"
     rb"HEIGHT (?P<height>[0-9]{1,10})\nVIEWPOINT (?P<viewpoint>[^\n]*)\n"
     rb"POINTS (?P<points>[0-9]{1,10})\nDATA (?P<data>[a-z_]*)\n"
@@ -160,6 +166,7 @@ class _HeaderParser:
         self.values: dict[bytes, list[bytes]] = {}
         self.offsets: dict[bytes, int] = {}
         self.warnings: list[str] = []
+        self.comments: list[str] = []
 
     def parse(self) -> PcdHeader:
         data_offset = self._read_lines()
@@ -175,6 +182,7 @@ class _HeaderParser:
             version=b" ".join(self.values.get(b"VERSION", [])).decode("latin-1"),
             data_offset=data_offset,
             warnings=tuple(self.warnings),
+            crs=system_of_comments(self.comments),
         )
         _check_size(header, self.path, self.file_bytes)
         return header
@@ -196,6 +204,7 @@ class _HeaderParser:
             if end < 0 and len(self.head) < self.file_bytes:
                 break
             if not words or words[0].startswith(b"#"):
+                self.comments.append(decoded(b" ".join(words).lstrip(b"# ")))
                 continue
             key = words[0].upper()
             key = _ALIASES.get(key, key)

@@ -324,5 +324,11 @@ def test_a_geographic_system_in_a_las_file(
         extended=where == "extended",
     )
     assert (GEOGRAPHIC_SYSTEM in describe(tmp_path / "in.las").warnings) == named
-    made = divide([tmp_path / "in.las"], tmp_path / "map", DivideSettings(durable=False))
+    if named:
+        for unit in ("", "auto", "ft", "mm"):
+            with pytest.raises(MapDataError, match="x and y are degrees") as caught:
+                divide([tmp_path / "in.las"], tmp_path / "map", DivideSettings(durable=False, unit=unit))
+            assert caught.value.cause == "not_metres"
+            assert "UTM" in str(caught.value)
+    made = divide([tmp_path / "in.las"], tmp_path / "map", DivideSettings(durable=False, unit="m"))
     assert any(GEOGRAPHIC_SYSTEM in note for note in made.notes) == named

@@ -3,9 +3,12 @@
 
 from __future__ import annotations
 
+import struct
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
+import laspy
 import numpy as np
 import pytest
 
@@ -126,3 +129,146 @@ def test_records_that_are_not_there(tmp_path: Path, at: int) -> None:
         except MapDataError as error:
             points = POINTS if error.cause in ("bad_las", "truncated") else -1
         assert points == POINTS
+
+
+# --- records that announce more than they have -------------------------------------------------------------
+
+UTM = b'PROJCS["WGS 84 / UTM zone 32N",GEOGCS["W"],UNIT["metre",1],AUTHORITY["EPSG","32632"]]'
+
+
+def with_extended(path: Path, records: list[tuple[int, int, bytes]], **header: int) -> Path:
+    """Append extended records (number, announced bytes, bytes); long ones become holes of the file."""
+    data = bytearray(las_file(path).read_bytes())
+    at, count = header.get("at", len(data)), header.get("count", len(records))
+    struct.pack_into("<QI", data, 235, at, count)
+    with open(path, "wb") as file:
+        file.write(data)
+        for number, announced, content in records:
+            file.write(struct.pack("<2x16sHQ32x", b"LASF_Projection", number, announced) + content)
+            if announced < 1 << 40:
+                file.seek(announced - len(content), 1)
+        file.truncate()
+    return path
+
+
+@pytest.mark.parametrize("suffix", ["las", "laz"])
+@pytest.mark.parametrize(
+    ("records", "header", "warned", "named"),
+    [
+        ([(1, 3 << 30, b""), (2112, len(UTM), UTM)], {}, "", True),
+        ([(2112, 3 << 30, UTM)], {}, "", True),
+        ([(1, 1 << 62, b"abc")], {}, "behind the file's end", False),
+        ([(2112, 1 << 62, UTM)], {}, "behind the file's end", True),
+        ([(1, 3, b"abc")], {"at": 0}, "1 extended records announced at byte 0", False),
+        ([(1, 3, b"abc")], {"at": 1 << 62}, "1 extended records announced at byte 4611", False),
+        ([(2112, len(UTM), UTM)], {"count": 0xFFFFFFFF}, "where there is room for 2", True),
+    ],
+)
+def test_extended_records_are_not_read_for_nothing(
+    tmp_path: Path,
+    suffix: str,
+    records: list[tuple[int, int, bytes]],
+    header: dict[str, int],
+    warned: str,
+    named: bool,
+) -> None:
+    path = with_extended(tmp_path / f"a.{suffix}", records, **header)
+    tracemalloc.start()
+    try:
+        found = describe(path)
+        assert tracemalloc.get_traced_memory()[1] < 50 << 20
+    finally:
+        tracemalloc.stop()
+    assert found.points == POINTS
+    assert warned in " ".join(found.warnings)
+    assert bool(found.warnings) == bool(warned)
+    assert (found.crs is not None and found.crs.epsg == 32632) == named
+
+
+def test_a_gap_before_the_points_is_not_read(tmp_path: Path) -> None:
+    data = bytearray(las_file(tmp_path / "a.las").read_bytes())
+    (data_at,) = struct.unpack_from("<I", data, 96)
+    struct.pack_into("<I", data, 96, 3 << 30)
+    with open(tmp_path / "a.las", "wb") as file:
+        file.write(data[:data_at])
+        file.seek(3 << 30)
+        file.write(data[data_at:])
+    tracemalloc.start()
+    try:
+        cloud = read_cloud(tmp_path / "a.las")
+        assert tracemalloc.get_traced_memory()[1] < 50 << 20
+    finally:
+        tracemalloc.stop()
+    np.testing.assert_allclose(cloud.xyz[:, 0], np.arange(POINTS) * 0.1, atol=0.005)
+
+
+def test_a_table_of_more_chunks_than_memory(tmp_path: Path) -> None:
+    path = las_file(tmp_path / "a.laz")
+    data = bytearray(path.read_bytes())
+    (data_at,) = struct.unpack_from("<I", data, 96)
+    struct.pack_into("<q", data, data_at, 3 << 30)
+    with open(path, "wb") as file:
+        file.write(data)
+        file.seek(3 << 30)
+        file.write(struct.pack("<II", 0, 1 << 27) + bytes(1 << 10))
+    with pytest.raises(MapDataError, match="134217728 chunks announced"):
+        describe(path)
+
+
+@pytest.mark.parametrize("suffix", ["las", "laz"])
+@pytest.mark.parametrize(
+    ("there", "described", "kept", "lost"),
+    [
+        ([("a", "f4")], [("a", "f4"), ("b", "f8")], ["a"], "'b'"),
+        ([], [("a", "f4"), ("b", "f8")], [], "'a', 'b'"),
+        ([("a", "u1"), ("b", "3f4")], [("a", "u1"), ("b", "3f4"), ("c", "i2")], ["a", "b"], "'c'"),
+        ([("a", "u1"), ("b", "f4")], [("a", "u1"), ("b", "f4")], ["a", "b"], ""),
+    ],
+)
+def test_extra_bytes_that_the_points_do_not_have(
+    tmp_path: Path,
+    suffix: str,
+    there: list[tuple[str, str]],
+    described: list[tuple[str, str]],
+    kept: list[str],
+    lost: str,
+) -> None:
+    def written(name: str, dims: list[tuple[str, str]]) -> bytes:
+        header = laspy.LasHeader(point_format=6, version="1.4")
+        header.add_extra_dims([laspy.ExtraBytesParams(*dim) for dim in dims])
+        header.vlrs.append(laspy.VLR("pad", 1, "", b""))  # so that the record can grow over it
+        las = laspy.LasData(header)
+        las.x = las.y = las.z = np.arange(POINTS) * 0.1
+        for dim, kind in dims:
+            las[dim] = (
+                np.arange(POINTS * int(kind[0] if kind[0].isdigit() else 1)).reshape(POINTS, -1).squeeze()
+            )
+        las.write(str(tmp_path / name))
+        return (tmp_path / name).read_bytes()
+
+    original, more = (written(f"{name}.{suffix}", dims) for name, dims in (("a", there), ("b", described)))
+    (old_at,), (new_at,) = (struct.unpack_from("<I", data, 96) for data in (original, more))
+    records = more[375:new_at] if suffix == "las" else None
+    if records is None:  # the LASzip record is that of the points
+        at = more.index(b"LASF_Spec") - 2
+        (size,) = struct.unpack_from("<H", more, at + 20)
+        rest = original[375:old_at]
+        if there:
+            own = rest.index(b"LASF_Spec") - 2
+            rest = rest[:own] + rest[own + 54 + struct.unpack_from("<H", rest, own + 20)[0] :]
+        records = more[at : at + 54 + size] + rest
+    shift = 375 + len(records) - old_at
+    data = bytearray(original[:375] + records + original[old_at:])
+    struct.pack_into("<II", data, 96, 375 + len(records), struct.unpack_from("<I", more, 100)[0])
+    if suffix == "laz":
+        struct.pack_into(
+            "<q", data, 375 + len(records), struct.unpack_from("<q", original, old_at)[0] + shift
+        )
+    path = tmp_path / f"c.{suffix}"
+    path.write_bytes(bytes(data))
+    cloud = read_cloud(path)
+    assert [name for name in cloud.columns if name in "abc"] == kept
+    for name in kept:
+        np.testing.assert_array_equal(cloud.columns[name], laspy.read(tmp_path / f"a.{suffix}")[name])
+    assert lost in said(path)
+    assert bool(said(path)) == bool(lost)

@@ -99,7 +99,7 @@ def test_a_header_may_put_the_coordinates_anywhere(tmp_path: Path) -> None:
         ("a.csv", "1,2,3\n1,2 3\n", "bad_row", "line 2: '1,2 3' is not 3 values", 6),
         ("a.csv", "1,2,3\n1;2;3\n", "bad_row", "line 2", 6),
         ("a.csv", "1,,2,3\n", "bad_row", "empty value", 0),
-        ("a.csv", "lat,lon,height\n1,2,3\n", "bad_header", "x, y and z", 0),
+        ("a.csv", "azimuth,elevation,range\n1,2,3\n", "bad_header", "x, y and z", 0),
         ("a.csv", "x,y,z,i\n1,2,3\n", "bad_header", "names no 3 columns", 0),
         ("a.csv", "x,y,z,x\n1,2,3,4\n", "bad_header", "names no 4 columns", 0),
         ("a.csv", b"\xff\xfex\x00", "bad_row", "UTF-16", 0),

@@ -41,7 +41,7 @@ _FILES = (
     Column("FORMAT", spare=4),
     Column("SIZE", "right", spare=3),
     Column("POINTS", "right"),
-    Column("NOT FINITE", "right", spare=6),
+    Column("LEFT OUT", "right", spare=6),
     Column("X", "right", spare=1),
     Column("Y", "right", spare=1),
     Column("Z", "right", spare=2),
@@ -86,7 +86,12 @@ def run(args: argparse.Namespace) -> int:
         print_table(
             (Column("FIELD"), Column("DTYPE"), Column("COUNT", "right"), Column("UNIT")),
             [
-                [_field_name(spec.name), spec.dtype.str, str(spec.components), spec.unit]
+                [
+                    _field_name(spec.name),
+                    spec.dtype.str,
+                    str(spec.components),
+                    spec.unit if spec.name != "xyz" or _in_metres(found.crs) else "",
+                ]
                 for spec in found.columns
             ],
         )
@@ -149,7 +154,7 @@ def _directory(args: argparse.Namespace) -> int:
         print_pairs(
             [
                 ("files", f"{len(found):,}" + (f", {len(failed):,} that cannot be read" if failed else "")),
-                ("points", f"{points:,}" + (f", {dropped:,} not finite" if dropped else "")),
+                ("points", f"{points:,}" + (f", {dropped:,} left out" if dropped else "")),
                 ("size", format_bytes(nbytes)),
                 *_bounds_lines(bounds),
                 *_grouped_warnings(found),
@@ -288,7 +293,7 @@ def _crs_lines(crs: CoordinateSystem | None) -> list[tuple[str, str]]:
 
     said = "x and y are in degrees" if crs.geographic else units_text(*crs.units)
     unsaid = "" if crs.geographic or crs.plane is not None else " (taken so: the file does not say)"
-    return [("crs", crs.label or "without a name"), ("units", said + unsaid)]
+    return [*([("crs", crs.label)] if crs.label else []), ("units", said + unsaid)]
 
 
 def _in_metres(crs: CoordinateSystem | None) -> bool:
@@ -312,7 +317,7 @@ def _lines(found: CloudDescription) -> list[tuple[str, str]]:
     kind = " ".join(part for part in (found.format.upper(), found.version, found.encoding) if part)
     lines = [
         ("file", f"{found.path} ({format_bytes(found.file_bytes)}, {kind})"),
-        ("points", f"{found.points:,}" + (f", {found.dropped:,} not finite" if found.dropped else "")),
+        ("points", f"{found.points:,}" + (f", {found.dropped:,} left out" if found.dropped else "")),
     ]
     if found.height > 1:
         lines.append(("organised", f"{found.width} x {found.height}"))

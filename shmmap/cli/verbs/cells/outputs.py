@@ -209,7 +209,9 @@ class CloudFile(msgspec.Struct):
     version: str
     file_bytes: int
     points: Annotated[int, msgspec.Meta(description="in the file")]
-    dropped: Annotated[int, msgspec.Meta(description="those of them that are not finite")]
+    dropped: Annotated[
+        int, msgspec.Meta(description="those of them that are left out: not finite, or flagged withheld")
+    ]
     width: int
     height: int
     fields: list[Field]

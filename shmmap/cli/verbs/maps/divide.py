@@ -7,7 +7,7 @@ import argparse
 import time
 from typing import TYPE_CHECKING, NoReturn
 
-from shmmap.cli.options import Subparsers, add_json_option, add_unit_options, add_verb, numbers, size_bytes
+from shmmap.cli.options import Subparsers, add_cloud_options, add_json_option, add_verb, numbers, size_bytes
 from shmmap.cli.program import complain
 from shmmap.cli.screens.output import counted, format_bytes
 from shmmap.cli.screens.work_progress import StageProgress, fields_text, print_result
@@ -23,8 +23,9 @@ _DIVIDE_EPILOG = """\
 IN is a file (.pcd in every encoding, .las .laz .copc.laz, .ply .pts .xyz .xyzn .xyzrgb, or a table of
 numbers: .txt .csv .asc) or a directory of files, tables left out; all together become one map.  Files may
 be larger than memory.
-A cell has the points with x0 <= x < x0 + size and y0 <= y < y0 + size; points that are not finite are
-left out and counted.  All fields are kept, with their types, unless --fields names those to keep.
+A cell has the points with x0 <= x < x0 + size and y0 <= y < y0 + size; points that are not finite, and
+those that a LAS file flags withheld, are left out and counted.  All fields are kept, with their types,
+unless --fields names those to keep.
 OUT appears complete or not at all.  Autoware's map loader reads it.
 Exit code: 0, 2 wrong usage or OUT exists, 65 bad data or no finite point, 66 no such input,
 73 OUT cannot be written, 75 another run is making OUT."""
@@ -65,7 +66,7 @@ def add_divide(subparsers: Subparsers) -> None:
         "float32 would lose more than 0.5 mm where they are, as `serve` does with a cloud; none keeps their "
         "frame, in float64 where needed",
     )
-    add_unit_options(points)
+    add_cloud_options(points)
     points.add_argument(
         "--leaf",
         metavar="METRES",
@@ -126,6 +127,7 @@ def run_divide(args: argparse.Namespace) -> int:
         translate=args.translate,
         unit=args.unit or "",
         vertical_unit=args.vertical_unit or "",
+        drop_noise=args.drop_noise,
         leaf=args.leaf,
         prefix=args.prefix,
         encoding=args.encoding,
@@ -173,7 +175,7 @@ def translation(text: str) -> Translation:
 
 
 def _divided_lines(made: DividedMap) -> list[tuple[str, str]]:
-    left_out = f", {made.dropped:,} not finite" if made.dropped else ""
+    left_out = f", {made.dropped:,} left out" if made.dropped else ""
     lines = [
         ("map", made.path),
         ("cells", f"{made.cells:,}, side {made.cell_size:g} m"),

@@ -8,7 +8,7 @@ import os
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
-from shmmap.cli.options import add_unit_options, at_least
+from shmmap.cli.options import add_cloud_options, at_least
 from shmmap.cli.screens.output import print_line
 from shmmap.cli.screens.work_progress import StageProgress
 from shmmap.errors import BadRequest, ConfigError
@@ -50,7 +50,7 @@ def add_map_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--strict", action="store_true", help="accept only what Autoware's own loader accepts"
     )
-    add_unit_options(parser)
+    add_cloud_options(parser)
     parser.add_argument(
         "--workers",
         metavar="N",
@@ -62,7 +62,7 @@ def add_map_options(parser: argparse.ArgumentParser) -> None:
 
 def refuse_map_options(args: argparse.Namespace, what: str, others: Sequence[str] = ()) -> None:
     """Refuse ``others`` and options for reading files where no file is read; ``what`` is the reason."""
-    for option in ("metadata", "strict", "unit", "vertical_unit", *others):
+    for option in ("metadata", "strict", "unit", "vertical_unit", "drop_noise", *others):
         if getattr(args, option):
             raise BadRequest(f"--{option.replace('_', '-')} does not go with {what}")
 
@@ -78,6 +78,7 @@ def origin_at(args: argparse.Namespace, cache_dir: str) -> MapOrigin:
         cache_dir=cache_dir,
         unit=args.unit or "",
         vertical_unit=args.vertical_unit or "",
+        drop_noise=args.drop_noise,
     )
 
 
