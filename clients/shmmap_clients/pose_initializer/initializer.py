@@ -513,6 +513,8 @@ class Relocalizer:
         search.
     sigma_m, sigma_yaw
         Standard deviation of x and y, metres, and of the heading, radians, at the first attempt.
+    knows_z
+        Whether the height of the first predicted pose is known; after a success it is.
 
     Attributes
     ----------
@@ -521,12 +523,18 @@ class Relocalizer:
     """
 
     def __init__(
-        self, initializer: Callable[[], PoseInitializer], *, sigma_m: float = 2.0, sigma_yaw: float = 0.1745
+        self,
+        initializer: Callable[[], PoseInitializer],
+        *,
+        sigma_m: float = 2.0,
+        sigma_yaw: float = 0.1745,
+        knows_z: bool = True,
     ) -> None:
         self._make = initializer
         self._initializer: PoseInitializer | None = None
         self._sigma_m = sigma_m
         self._sigma_yaw = sigma_yaw
+        self._knows_z = knows_z
         self._failures = 0
         self.error: ShmmapError | None = None
 
@@ -543,7 +551,14 @@ class Relocalizer:
         wider = 2 ** min(self._failures, _DOUBLINGS)
         x, y, z, roll, pitch, yaw = pose_from_matrix(T_guess).tolist()
         rough = RoughPose(
-            x, y, z, roll, pitch, yaw, sigma_m=self._sigma_m * wider, sigma_yaw=self._sigma_yaw * wider
+            x,
+            y,
+            z if self._knows_z else None,
+            roll,
+            pitch,
+            yaw,
+            sigma_m=self._sigma_m * wider,
+            sigma_yaw=self._sigma_yaw * wider,
         )
         self._failures += 1
         self.error = None
@@ -556,5 +571,5 @@ class Relocalizer:
             return None
         if not found.reliable:
             return None
-        self._failures = 0
+        self._failures, self._knows_z = 0, True
         return found.result
