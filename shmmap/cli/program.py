@@ -9,17 +9,19 @@ import errno
 import os
 import re
 import sys
+import warnings
 from collections.abc import Callable, Container, Iterable, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any, Final, NoReturn
 
-from shmmap.errors import CannotWrite, InternalError, ShmmapError
+from shmmap.errors import CannotWrite, InternalError, ShmmapError, ShmmapWarning
 from shmmap.formats.durable_file import writing_errors
 
 __all__ = [
     "Parser",
     "add_allow_empty",
+    "check_terminal",
     "complain",
     "exit_code_of",
     "join_negative_values",
@@ -67,6 +69,13 @@ class Parser(argparse.ArgumentParser):
             self._refuse(f"unknown option {word}", word)
         self._refuse(f"unexpected argument: {' '.join(unknown)}", word)
 
+    def _print_message(self, message: str, file: Any = None) -> None:
+        """Write help or a version; argparse itself ignores errors of writing."""
+        if file is sys.stdout and message:
+            file.write(message)
+        else:
+            super()._print_message(message, file)
+
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if isinstance(action, argparse._SubParsersAction) and value not in action.choices:
             self._refuse(f"there is no {str(action.metavar).lower()} {value!r}", str(value), action.choices)
@@ -113,9 +122,9 @@ def exit_code_of(name: str, run: Callable[[], int]) -> int:
     """Run a program and return its exit code; print its errors on stderr."""
     _open_what_is_closed()
     keep_interrupts()
+    _show_warnings(name)
     try:
-        code = run()
-        sys.stdout.flush()
+        code = _flushed(run)
     except ShmmapError as error:
         complain(name, error.message, error.hint)
         return error.exit_code
@@ -129,6 +138,9 @@ def exit_code_of(name: str, run: Callable[[], int]) -> int:
         if _is_of_interrupt(error):
             _forget_interrupt()
             return _EXIT_INTERRUPTED
+        if isinstance(error, OSError) and error.errno == errno.EIO and error.filename is None:
+            _drop_output()  # of a terminal that is gone
+            return _EXIT_BROKEN_PIPE
         if isinstance(error, OSError) and error.errno in _FULL and error.filename is None:
             _drop_output()
             complain(
@@ -145,6 +157,49 @@ def exit_code_of(name: str, run: Callable[[], int]) -> int:
         )
         return InternalError.exit_code
     return code
+
+
+def _flushed(run: Callable[[], int]) -> int:
+    """Run a program and write what it printed, also if it ended early, as for ``--help``."""
+    try:
+        code = run()
+    except SystemExit:
+        sys.stdout.flush()
+        raise
+    sys.stdout.flush()
+    return code
+
+
+def check_terminal(*, was_there: bool) -> None:
+    """End a program that shows something without end, if the terminal on stdout is gone.
+
+    Its session may be ended without a SIGHUP, or the program may ignore that.
+
+    Raises
+    ------
+    BrokenPipeError
+        The terminal is gone; output is discarded from now on.
+    """
+    if was_there and not sys.stdout.isatty():
+        _drop_output()
+        raise BrokenPipeError
+
+
+def _show_warnings(name: str) -> None:
+    """From now on print a `ShmmapWarning` as its text alone: a line of the library means nothing here."""
+    before = warnings.showwarning
+
+    def show(message: Warning | str, category: type[Warning], *where: Any) -> None:
+        if not issubclass(category, ShmmapWarning):
+            before(message, category, *where)
+            return
+        from shmmap.cli.screens.output import print_line
+
+        first, *more = str(message).splitlines()
+        for line in (f"{name}: {first}", *more):
+            print_line(line, file=sys.stderr)
+
+    warnings.showwarning = show
 
 
 def _forget_interrupt() -> None:
@@ -173,7 +228,7 @@ def _open_what_is_closed() -> None:
 
 
 def _drop_output() -> None:
-    """Discard what stdout still buffers, since the interpreter flushes it at exit."""
+    """Discard what stdout still buffers or gets, since the interpreter flushes it at exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 

@@ -34,6 +34,7 @@ BASE = {
     "quantities",
     "lacking",
     "kernel_cache",
+    "open3d_loading",
     "compiling",
     "large_tables",
     "disk_budget",
@@ -56,6 +57,7 @@ PARTS = {
     "segment": {"errors", "columns", "geometry", "failpoints", "lazy_imports", "mounts"},
     "protocol": {"errors", "columns", "geometry"},
     "kernel_cache": {"logfmt", "version"},
+    "open3d_loading": {"errors"},
     "compiling": {"kernel_cache", "version"},
     "version": set[str](),
     "mounts": set[str](),
@@ -73,6 +75,7 @@ PARTS = {
     "client": {
         "errors", "columns", "failpoints", "geometry", "lacking", "lazy_imports", "chunks",
         "segment", "protocol", "statistics.layout",
+        "open3d_loading",
     },
     "daemon": BASE | {
         "chunks", "formats", "segment", "protocol", "statistics", "layers", "origin", "dividing",
