@@ -25,6 +25,7 @@ from numba.core.caching import NullCache
 from numba.core.typeinfer import register_dispatcher
 
 from shmmap.kernel_cache import discard, read_kernel, write_kernel
+from shmmap.kernel_reports import compiling
 from shmmap.version import __version__
 
 __all__ = ["compiled", "inlined", "read_only"]
@@ -51,6 +52,7 @@ class _KernelFiles(NullCache):
         code = function.__code__
         closure = tuple(cell.cell_contents for cell in function.__closure__ or ())
         self._made_from = _dumps((_VERSIONS, source, code.co_code, closure))
+        self._folder, self._reported = Path(code.co_filename).parent, False
         self._stem = f"{Path(code.co_filename).stem}.{function.__name__}-{code.co_firstlineno}"
         self._where = f"{code.co_filename} {function.__qualname__} {sys.implementation.cache_tag}"
 
@@ -60,6 +62,9 @@ class _KernelFiles(NullCache):
         name = self._name(sig, target_context.codegen())
         data = read_kernel(name, self._made_from)
         if data is None:
+            if not self._reported:  # not again for other types
+                self._reported = True
+                compiling(self._folder)
             return None
         try:
             return _CompileResult._rebuild(target_context, *pickle.loads(data))  # noqa: S301  its owner was checked

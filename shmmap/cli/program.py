@@ -17,6 +17,7 @@ from typing import Any, Final, NoReturn
 
 from shmmap.errors import CannotWrite, InternalError, ShmmapError, ShmmapWarning
 from shmmap.formats.durable_file import writing_errors
+from shmmap.kernel_reports import report_to
 
 __all__ = [
     "Parser",
@@ -123,6 +124,7 @@ def exit_code_of(name: str, run: Callable[[], int]) -> int:
     _open_what_is_closed()
     keep_interrupts()
     _show_warnings(name)
+    report_to(_CompilingNote(name))
     try:
         code = _flushed(run)
     except ShmmapError as error:
@@ -183,6 +185,21 @@ def check_terminal(*, was_there: bool) -> None:
     if was_there and not sys.stdout.isatty():
         _drop_output()
         raise BrokenPipeError
+
+
+class _CompilingNote:
+    """Says on stderr, once, that kernels compile; on a terminal also how far that is."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._said = False
+
+    def __call__(self, package: str, number: int, count: int) -> None:
+        """Say it, at the first kernel; see `shmmap.kernel_reports.report_to`."""
+        if not self._said or sys.stderr.isatty():
+            what = f"{number} of {count} ({package})"
+            complain(self._name, f"compiling kernels, once on this machine: {what}")
+            self._said = True
 
 
 def _show_warnings(name: str) -> None:

@@ -106,6 +106,10 @@ def test_pending_cells(served: DaemonProcess, tmp_path: Path) -> None:
         assert done.returncode == 1
         said = r"shmmap: 3 layers of cells are still pending after 0\.2 s: .*\d+ loaders?.*\n"
         assert re.match(said + r"hint: .* wait longer: --wait SECONDS", done.stderr), done.stderr
+        shell = Shmmap(served, tmp_path)
+        shell.environment["NUMBA_CACHE_DIR"] = str(tmp_path)  # no kernels are kept
+        done = shell.run("query", "--circle", "1,1,5", "--layer", "ndt(leaf=2.0)", "--wait", "3")
+        assert "first layer: its kernels compile, once on this machine" in done.stderr
         with pytest.raises(LoadTimeout, match=r"still being loaded, and 2 more \(ask again, or wait longer"):
             client.around(1, 1, 5, wait=0.2, strict=True)
         assert len(client.around(1, 1, 5, wait=None).pending) == 3, "no request waited for them"

@@ -20,7 +20,8 @@ from typing import Any
 
 import pytest
 
-from shmmap import kernel_cache
+from shmmap import kernel_cache, kernel_reports
+from shmmap.cli.program import exit_code_of
 from shmmap.layers import build
 
 pytest.importorskip("numba", reason="needs the package numba")
@@ -80,6 +81,30 @@ def test_what_is_compiled_is_kept(kernel: Kernel, caplog: pytest.LogCaptureFixtu
     assert stat.S_IMODE(kernel.directory.stat().st_mode) == 0o700
     assert kernel_cache.all_kept()
     assert not warnings(caplog)
+
+
+def test_what_is_compiled_is_reported_once_and_what_is_kept_is_not(
+    kernel: Kernel, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(kernel_reports, "_reports", [])
+    monkeypatch.setattr(kernel_reports, "_numbers", {})
+    two_types = "compiled(types.int64(types.int64), types.float64(types.float64))"
+    kernel.module.write_text(
+        SOURCE.replace("compiled(types.int64(types.int64))", two_types)
+        + "\n@compiled(types.int64(types.int64))\ndef halved(value):\n    return value // 2\n"
+    )
+    reports: list[tuple[str, int, int]] = []
+    kernel_reports.report_to(lambda *what: reports.append(what))
+    kernel.hits()
+    folder = kernel.module.parent.name
+    assert reports == [(folder, 1, 2), (folder, 2, 2)], "a kernel once, for all its types"
+    kernel.hits()
+    assert len(reports) == 2
+    for file in kernel.directory.glob("*.kernel"):
+        file.unlink()
+    assert exit_code_of("some-program", lambda: kernel.hits() * 0) == 0
+    said = capsys.readouterr().err
+    assert said == f"some-program: compiling kernels, once on this machine: 3 of 3 ({folder})\n"
 
 
 def test_another_source_is_another_kernel(kernel: Kernel, caplog: pytest.LogCaptureFixture) -> None:

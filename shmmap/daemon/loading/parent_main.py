@@ -28,6 +28,8 @@ from shmmap.daemon.host.scheduling import take_slices
 from shmmap.daemon.loading import worker_messages
 from shmmap.daemon.loading.worker_main import WorkerSettings, limit_memory, work
 from shmmap.kernel_cache import compiled_mark
+from shmmap.kernel_reports import report_to
+from shmmap.logfmt import log
 from shmmap.processes.end_with_parent import die_with
 from shmmap.processes.start_child import channel_to_parent, receive_packet
 from shmmap.version import __version__
@@ -55,11 +57,24 @@ def _run_child(parent: int, run: Callable[[], int]) -> NoReturn:
 def _compile() -> int:
     """Compile the kernels of layers, unless another daemon is doing so; return the exit code."""
     os.nice(_MAX_NICE)
+    report_to(_log_first())
     from shmmap.layers.build import compile_kernels
 
     with contextlib.suppress(MemoryError):
         compile_kernels(wait=False)
     return 0
+
+
+def _log_first() -> Callable[[str, int, int], None]:
+    """Return a function that logs the first of the kernels that are compiled."""
+    said: list[str] = []
+
+    def report(package: str, _number: int, count: int) -> None:
+        if not said:
+            said.append(package)
+            log.info("compiling kernels, once on this machine", of=package, kernels=count)
+
+    return report
 
 
 @dataclass(eq=False, slots=True)

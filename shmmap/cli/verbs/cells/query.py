@@ -6,7 +6,8 @@ from __future__ import annotations
 import argparse
 import contextlib
 import re
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Final
 
 from shmmap.cli.areas import add_area_or_ids, area_from, no_cell_there, print_near_cells
 from shmmap.cli.daemon_address import connect, snapshot
@@ -53,6 +54,9 @@ Exit code: 0; 1 when a cell is pending, failed or unknown, when the daemon does 
 the area, when the area touches no cell, or when a layer is empty in every cell.
 With --held, 0 when nothing is new."""
 
+
+_NOTE_S: Final = 1.0
+"""Seconds of waiting for layers after which `query` says why it may take long."""
 
 _COLUMNS = (
     Column("CELL"),
@@ -111,12 +115,13 @@ def run(args: argparse.Namespace) -> int:
         raise BadRequest("--held needs an area", hint="add --circle, --square or --box")
     layers = layers_from(args)
     with connect(args) as client:
-        if area is None:
-            found = client.selected(args.id, layers, wait=args.wait, strict=None)
-        elif held_given:
-            found = client.differential(area, held, layers, wait=args.wait, strict=None)
-        else:
-            found = client.area(area, layers, wait=args.wait, strict=None)
+        with _note_of_compiling(args, layers):
+            if area is None:
+                found = client.selected(args.id, layers, wait=args.wait, strict=None)
+            elif held_given:
+                found = client.differential(area, held, layers, wait=args.wait, strict=None)
+            else:
+                found = client.area(area, layers, wait=args.wait, strict=None)
         welcome = client.welcome
         if args.json:
             from shmmap.cli.verbs.cells import outputs
@@ -134,8 +139,36 @@ def run(args: argparse.Namespace) -> int:
         return _judge_empty(args, client, area, found)
 
 
+@contextlib.contextmanager
+def _note_of_compiling(args: argparse.Namespace, layers: Sequence[str]) -> Iterator[None]:
+    """Say after a moment of waiting for a daemon's first layer that its kernels compile once."""
+    if all(layer == "points" for layer in layers):
+        yield
+        return
+    import threading
+
+    from shmmap.kernel_cache import are_compiled
+
+    def look() -> None:
+        with contextlib.suppress(ShmmapError, OSError):
+            counts = snapshot(args)[0].counters
+            if not (counts.get("layers_computed", 0) or counts.get("loads_from_cache", 0) or are_compiled()):
+                complain(
+                    "shmmap",
+                    "waiting for the daemon's first layer: its kernels compile, once on this machine",
+                )
+
+    timer = threading.Timer(_NOTE_S, look)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
 def _still_pending(args: argparse.Namespace, found: CellSet) -> tuple[str, str]:
-    """Return why layers are pending after the wait, as far as the statistics tell, and what to do."""
+    """Return why layers are pending after the wait, as far as the statistics show it, and what to do."""
     layers = counted(len(found.pending), "layer")
     what = (
         f"{layers} of cells {'is' if len(found.pending) == 1 else 'are'} still pending after {args.wait:g} s"
