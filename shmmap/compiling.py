@@ -55,7 +55,7 @@ class _KernelFiles(NullCache):
         self._stem = f"{Path(code.co_filename).stem}.{function.__name__}-{code.co_firstlineno}"
         self._where = f"{code.co_filename} {function.__qualname__} {sys.implementation.cache_tag}"
         lines = source.splitlines()
-        self._module = function.__module__
+        self._module, self._is_noticed = function.__module__, False
         self._number, self._of = _count(lines[: code.co_firstlineno]), _count(lines)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
@@ -68,7 +68,9 @@ class _KernelFiles(NullCache):
                 return _CompileResult._rebuild(target_context, *pickle.loads(data))  # noqa: S301  its owner was checked
             except Exception as error:  # noqa: BLE001  after any error the kernel can be compiled
                 discard(name, error)
-        notice(self._module, self._number, self._of)
+        if not self._is_noticed:  # once for all its types
+            self._is_noticed = True
+            notice(self._module, self._number, self._of)
         return None
 
     def save_overload(self, sig: Any, data: Any) -> None:

@@ -42,8 +42,10 @@
 
 from __future__ import annotations
 
+import sys
+import warnings
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, Final
 
 if TYPE_CHECKING:
     from shmmap.protocol.rows import Holder
@@ -84,7 +86,10 @@ __all__ = [
     "StaleSocket",
     "UnknownCell",
     "error_from_wire",
+    "warn_program",
 ]
+
+_OURS: Final = ("shmmap.", "shmmap_clients.")
 
 
 class ShmmapError(Exception):
@@ -111,6 +116,14 @@ class ShmmapError(Exception):
 
 class ShmmapWarning(UserWarning):
     """A result is incomplete or contradictory; the text contains the details and the reason."""
+
+
+def warn_program(text: str) -> None:
+    """Issue a `ShmmapWarning` at the line of the program that called the library."""
+    level, frame = 2, sys._getframe(1)
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith(_OURS):
+        level, frame = level + 1, frame.f_back
+    warnings.warn(text, ShmmapWarning, stacklevel=level)
 
 
 class ConfigError(ShmmapError):

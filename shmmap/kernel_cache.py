@@ -29,7 +29,15 @@ from shmmap.logfmt import log
 from shmmap.private_directory import PRIVATE, NotPrivate, opened_private, why_not_own
 from shmmap.version import __version__
 
-__all__ = ["all_kept", "compiled_mark", "discard", "kernel_directory", "read_kernel", "write_kernel"]
+__all__ = [
+    "all_kept",
+    "are_compiled",
+    "compiled_mark",
+    "discard",
+    "kernel_directory",
+    "read_kernel",
+    "write_kernel",
+]
 
 _MAGIC: Final = b"SHMMAPK\x01"
 _MAX_BYTES: Final = 64 << 20  # the largest kernel has a few hundred kB
@@ -64,6 +72,12 @@ def compiled_mark() -> Path | None:
     except OSError:
         return None
     return directory / f"layers-{__version__}-{sys.implementation.cache_tag}-{which:x}.compiled"
+
+
+def are_compiled() -> bool:
+    """Return whether the kernels of layers are known to be compiled, for this user."""
+    mark = compiled_mark()
+    return mark is not None and mark.is_file()
 
 
 def read_kernel(name: str, source: bytes) -> bytes | None:

@@ -6,12 +6,10 @@ That is cells that failed, are being loaded, or are empty, and areas where the m
 
 from __future__ import annotations
 
-import sys
-import warnings
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Final
 
-from shmmap.errors import LoadTimeout, Offline, ShmmapError, ShmmapWarning, UnknownCell
+from shmmap.errors import LoadTimeout, Offline, ShmmapError, UnknownCell, warn_program
 from shmmap.quantities import counted, format_bytes, format_metres
 
 if TYPE_CHECKING:
@@ -38,6 +36,7 @@ __all__ = [
 
 _NOT_COVERED: Final = "the daemon does not know yet all that the map has there"
 _OUT_OF_REACH: Final = "the list of cells there cannot be reached at present"
+_WAIT_LONGER: Final = "ask again, or wait longer: wait=SECONDS"
 _NAMED_CELLS: Final = 3
 _NAMED_CHUNKS: Final = 5
 _MAX_CELLS: Final = 20_000  # searching them for similar ids takes at most a second
@@ -87,9 +86,11 @@ def judge(
         return
     if len(lines) > _MAX_LINES:
         lines[_MAX_LINES:] = [f"... and {len(lines) - _MAX_LINES} more"]
+    if found.pending and waited:
+        lines.append(f"hint: what is pending is still being loaded: {_WAIT_LONGER}")
     if found.failed or (found.pending and waited):
         lines.insert(0, f"{len({cell.id for cell in found}):,} of {_asked(found):,} cells are there:")
-    warnings.warn("\n".join(lines), ShmmapWarning, stacklevel=_level_of_program())
+    warn_program("\n".join(lines))
 
 
 def warn_of_lost_chunks(name: str, lacking: Sequence[LackingChunk], count: int) -> None:
@@ -101,7 +102,7 @@ def warn_of_lost_chunks(name: str, lacking: Sequence[LackingChunk], count: int) 
     if count > _NAMED_CHUNKS:
         lines.append(f"... and {count - _NAMED_CHUNKS:,} more")
     lines.append("hint: `shmmap live ls` names the files; `shmmap live fsck --repair` forgets what is lost")
-    warnings.warn("\n".join(lines), ShmmapWarning, stacklevel=_level_of_program())
+    warn_program("\n".join(lines))
 
 
 def not_covered(found: CellSet) -> tuple[str, str]:
@@ -118,7 +119,7 @@ def _error_of(client: Client, found: CellSet, area: Area | None, new: bool) -> S
             f"{first.id} ({first.layer}): still being loaded" + (f", and {more} more" if more else ""),
             cell_id=first.id,
             layer=first.layer,
-            hint="ask again, or wait longer: wait=SECONDS",
+            hint=_WAIT_LONGER,
         )
     if not found.covered:
         message, hint = not_covered(found)
@@ -150,14 +151,6 @@ def _asked(found: CellSet) -> int:
     ids.update(cell.id for cell in found.pending)
     ids.update(error.cell_id for error in found.failed)
     return len(ids)
-
-
-def _level_of_program() -> int:
-    """Return the stack level of the program's own code."""
-    level, frame = 1, sys._getframe(1)
-    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("shmmap."):
-        level, frame = level + 1, frame.f_back
-    return level
 
 
 # --- failed and pending -------------------------------------------------------------------------------

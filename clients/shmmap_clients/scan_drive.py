@@ -186,7 +186,10 @@ def open_scans(source: str, poses: str | None, stack: ExitStack, reader: ScanRea
         The directory or the file cannot be read.
     """
     if not is_endpoint(source):
-        scans = ScanSequence(source, read_trajectory(poses) if poses else None, reader)
+        trajectory = read_trajectory(poses) if poses else None
+        for note in trajectory.notes if trajectory is not None else ():
+            reader.say(note)
+        scans = ScanSequence(source, trajectory, reader)
         if scans.pairing:
             reader.say(scans.pairing)
         return scans

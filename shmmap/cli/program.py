@@ -9,6 +9,7 @@ import errno
 import os
 import re
 import sys
+import warnings
 from collections.abc import Callable, Container, Iterable, Sequence
 from pathlib import Path
 from types import FrameType
@@ -16,12 +17,13 @@ from typing import Any, Final, NoReturn
 
 from shmmap.cli.compiling_lines import CompilingLines
 from shmmap.compile_notices import watch
-from shmmap.errors import CannotWrite, InternalError, ShmmapError
+from shmmap.errors import CannotWrite, InternalError, ShmmapError, ShmmapWarning
 from shmmap.formats.durable_file import writing_errors
 
 __all__ = [
     "Parser",
     "add_allow_empty",
+    "check_terminal",
     "complain",
     "exit_code_of",
     "join_negative_values",
@@ -68,6 +70,13 @@ class Parser(argparse.ArgumentParser):
         if word.startswith("-"):
             self._refuse(f"unknown option {word}", word)
         self._refuse(f"unexpected argument: {' '.join(unknown)}", word)
+
+    def _print_message(self, message: str, file: Any = None) -> None:
+        """Write help or a version; argparse itself ignores errors of writing."""
+        if file is sys.stdout and message:
+            file.write(message)
+        else:
+            super()._print_message(message, file)
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if isinstance(action, argparse._SubParsersAction) and value not in action.choices:
@@ -116,9 +125,9 @@ def exit_code_of(name: str, run: Callable[[], int]) -> int:
     _open_what_is_closed()
     keep_interrupts()
     watch(CompilingLines(name))
+    _show_warnings(name)
     try:
-        code = run()
-        sys.stdout.flush()
+        code = _flushed(run)
     except ShmmapError as error:
         complain(name, error.message, error.hint)
         _leave_requests(error.exit_code)
@@ -138,6 +147,9 @@ def exit_code_of(name: str, run: Callable[[], int]) -> int:
             _forget_interrupt()
             _leave_requests(_EXIT_INTERRUPTED)
             return _EXIT_INTERRUPTED
+        if isinstance(error, OSError) and error.errno == errno.EIO and error.filename is None:
+            _drop_output()  # of a terminal that is gone
+            return _EXIT_BROKEN_PIPE
         if isinstance(error, OSError) and error.errno in _FULL and error.filename is None:
             _drop_output()
             complain(
@@ -166,6 +178,49 @@ def _leave_requests(code: object) -> None:
         os._exit(code)
 
 
+def _flushed(run: Callable[[], int]) -> int:
+    """Run a program and write what it printed, also if it ended early, as for ``--help``."""
+    try:
+        code = run()
+    except SystemExit:
+        sys.stdout.flush()
+        raise
+    sys.stdout.flush()
+    return code
+
+
+def check_terminal(*, was_there: bool) -> None:
+    """End a program that shows something without end, if the terminal on stdout is gone.
+
+    Its session may be ended without a SIGHUP, or the program may ignore that.
+
+    Raises
+    ------
+    BrokenPipeError
+        The terminal is gone; output is discarded from now on.
+    """
+    if was_there and not sys.stdout.isatty():
+        _drop_output()
+        raise BrokenPipeError
+
+
+def _show_warnings(name: str) -> None:
+    """From now on print a `ShmmapWarning` as its text alone: a line of the library means nothing here."""
+    before = warnings.showwarning
+
+    def show(message: Warning | str, category: type[Warning], *where: Any) -> None:
+        if not issubclass(category, ShmmapWarning):
+            before(message, category, *where)
+            return
+        from shmmap.cli.screens.output import print_line
+
+        first, *more = str(message).splitlines()
+        for line in (f"{name}: {first}", *more):
+            print_line(line, file=sys.stderr)
+
+    warnings.showwarning = show
+
+
 def _forget_interrupt() -> None:
     """Clear CPython's record of an interrupt, so that the exit code counts.
 
@@ -192,7 +247,7 @@ def _open_what_is_closed() -> None:
 
 
 def _drop_output() -> None:
-    """Discard what stdout still buffers, since the interpreter flushes it at exit."""
+    """Discard what stdout still buffers or gets, since the interpreter flushes it at exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 

@@ -13,13 +13,12 @@ from __future__ import annotations
 
 import contextlib
 import os
-import warnings
 import weakref
 from collections import deque
 from queue import Empty, SimpleQueue
 
 from shmmap.client.cell import Access, Cell
-from shmmap.errors import SegmentError, ShmmapWarning
+from shmmap.errors import SegmentError, warn_program
 from shmmap.protocol.messages import Handle
 from shmmap.segment.attach import Owned, attach
 
@@ -103,11 +102,9 @@ class Attacher:
         self._cells[key] = found
         if (outside := attached.outside_points) and cell_id not in self._named_outside:
             self._named_outside.add(cell_id)
-            warnings.warn(
+            warn_program(
                 f"{cell.name}: {outside} of the cell's points lie outside its box {cell.box}:"
-                " was the file moved, and the map's metadata not?",
-                ShmmapWarning,
-                stacklevel=2,
+                " was the file moved, and the map's metadata not?"
             )
         return cell
 

@@ -273,10 +273,12 @@ class Cell:
         ------
         LimitReached
             There is no room for another mapping, and no memory for a copy.
+        ShmmapError
+            Open3D is not installed, or lacks libraries of the system; the hint names them.
         """
-        with needed_packages("to_open3d()"):
-            import open3d
+        from shmmap.open3d_loading import load_open3d
 
+        open3d = load_open3d("to_open3d()")
         cloud = open3d.t.geometry.PointCloud()
         for name, view in self._writable().items():
             # Open3D wants a row per point, also where a point has one value

@@ -320,6 +320,7 @@ class MapInMemory:
 
     def close(self, *, keep: bool) -> None:
         """End the loaders, and remove every name; with ``keep`` leave the segments' names to the next run."""
+        self.cache.events.close()
         self.scheduler.pool.close()
         self.adoption.close(keep=keep)
         self.cache.close(keep=keep)

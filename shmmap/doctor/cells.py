@@ -5,19 +5,23 @@ from __future__ import annotations
 
 import math
 import time
-from typing import Final
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Final
 
 from shmmap.doctor.diagnosis import ANSWER_S, Diagnosis
 from shmmap.doctor.verdicts import Finding, cache_verdict, fail, ok, outage_so_far, warn
 from shmmap.errors import ShmmapError
 from shmmap.quantities import counted, format_bytes, format_duration
 
-__all__ = ["check_cache", "check_cells", "check_prefetching"]
+if TYPE_CHECKING:
+    from shmmap.statistics.identity import DaemonIdentity
+
+__all__ = ["causes", "check_cache", "check_cells", "check_prefetching", "failing_cells"]
 
 SHORT: Final = ("out of memory", "of memory that a loader may use")
 """Texts in messages of loads that failed for lack of memory."""
 NAMED: Final = 3
-"""Failed cells that are listed with their causes, at most."""
+"""Causes of failures that are listed, at most."""
 MAX_MISS_SHARE: Final = 0.02
 """Tolerated share of cells that moving clients wait for, since the points where they turn are unknown."""
 
@@ -28,19 +32,20 @@ def check_cells(diagnosis: Diagnosis) -> Finding:
     if not failures:
         return ok("no load has failed")
     since = f"{counted(failures, 'load')} failed since the start"
-    if diagnosis.state != "healthy":
+    if diagnosis.state != "healthy" or diagnosis.identity is None:
         return warn(since, "`shmmap tail` names the cells once the daemon answers; so does its log")
     try:
-        failing = _failing(diagnosis)
+        failing = failing_cells(diagnosis.socket, diagnosis.identity, "shmmap doctor")
     except ShmmapError as error:
         return warn(f"{since}; the daemon was not asked which: {error.message}", "its log says which")
+    if not failing and (count := diagnosis.counters.get("unloadable", 0)):
+        return fail(
+            f"{since}; {counted(count, 'layer')} of cells still cannot be loaded", "its log says which"
+        )
     if not failing:
         return ok(f"{since}; no cell is known to fail now")
-    causes = "; ".join(_cause(*one, failing[one]) for one in list(failing)[:NAMED])
-    more = f"; and {len(failing) - NAMED:,} more" if len(failing) > NAMED else ""
-    fact = f"{counted(len({cell for cell, _ in failing}), 'cell')} cannot be loaded: {causes}{more}"
-    blamed = [cell for (cell, _), message in failing.items() if not any(map(message.__contains__, SHORT))]
-    if not blamed:
+    fact = f"{counted(len({cell for cell, _ in failing}), 'cell')} cannot be loaded: {causes(failing)}"
+    if all(any(map(text.__contains__, SHORT)) for text in failing.values()):
         return warn(
             fact,
             "the files are not to blame: give the daemon more memory (MemoryMax=, docker --memory), or divide"
@@ -48,17 +53,34 @@ def check_cells(diagnosis: Diagnosis) -> Finding:
         )
     if diagnosis.counters.get("origin_out", 0):
         return warn(fact, "they are loaded once the map's origin answers again: see the row `map`")
-    prefix = diagnosis.identity.id_prefix if diagnosis.identity is not None else ""
-    return warn(fact, f"`shmmap inspect {prefix}{blamed[0]}` reads the file and says what is wrong with it")
+    blamed = [cell for (cell, _), text in failing.items() if _cause(cell, text) != text]
+    if not blamed:
+        return fail(fact, "no file is named, so none may be to blame: the daemon's log says more")
+    prefix = diagnosis.identity.id_prefix
+    return fail(fact, f"`shmmap inspect {prefix}{blamed[0]}` reads the file and says what is wrong with it")
 
 
-def _cause(cell: str, layer: str, message: str) -> str:
-    """Describe a failure in a line; its message begins with the file's path, whose end is the cell's id."""
+def causes(failing: Mapping[tuple[str, str], str]) -> str:
+    """Describe failures by cell and layer: each cause once, with one cell and the number of others."""
+    cells: dict[str, list[str]] = {}
+    for (cell, layer), message in failing.items():
+        cells.setdefault(_cause(cell, message), []).append(f"{cell} ({layer})")
+    parts = [
+        f"{named[0]}{f' and {len(named) - 1:,} more' if named[1:] else ''}: {cause}"
+        for cause, named in list(cells.items())[:NAMED]
+    ]
+    if len(cells) > NAMED:
+        parts.append(f"and {counted(len(cells) - NAMED, 'more cause')}")
+    return "; ".join(parts)
+
+
+def _cause(cell: str, message: str) -> str:
+    """Return a failure without the path of its file, whose end is the cell's id, if it begins with that."""
     before, found, cause = message.partition(f"{cell}: ")
-    return f"{cell} ({layer}): {cause if found and before.startswith('/') else message}"
+    return cause if found and before.startswith("/") else message
 
 
-def _failing(diagnosis: Diagnosis) -> dict[tuple[str, str], str]:
+def failing_cells(socket: str, identity: DaemonIdentity, name: str) -> dict[tuple[str, str], str]:
     """Return the messages by cell and layer of failed loads that have not succeeded since, as far as known.
 
     Raises
@@ -69,16 +91,15 @@ def _failing(diagnosis: Diagnosis) -> dict[tuple[str, str], str]:
     from shmmap.client.event_stream import EventStream
     from shmmap.protocol.events import Changed, Failed, Loaded
 
-    started_s = diagnosis.identity.started_unix_ns * 1e-9 if diagnosis.identity is not None else 0.0
-    since_s = max(time.time() - started_s, 0.0) + 1.0
+    since_s = max(time.time() - identity.started_unix_ns * 1e-9, 0.0) + 1.0
     failing: dict[tuple[str, str], str] = {}
-    with EventStream(diagnosis.socket, since=since_s, name="shmmap doctor", timeout=ANSWER_S) as stream:
+    with EventStream(socket, since=since_s, name=name, timeout=ANSWER_S) as stream:
         while (event := stream.next(0.0)) is not None:
             if isinstance(event, Failed):
                 failing[event.id, event.layer] = event.message
             elif isinstance(event, Loaded):
                 failing.pop((event.id, event.layer), None)
-            elif isinstance(event, Changed) and event.how == "removed":
+            elif isinstance(event, Changed):
                 failing = {key: text for key, text in failing.items() if key[0] != event.id}
     return failing
 

@@ -9,37 +9,30 @@
 from __future__ import annotations
 
 import math
-import platform
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.errors import BadRequest, PackageMissing, ShmmapError
+from shmmap.errors import BadRequest
 from shmmap.layers.contract import LayerColumn, LayerKind, LayerTable, Parameter, Parameters, PointTable
+from shmmap.open3d_loading import load_open3d
 
 __all__ = [
     "CROP",
     "DENOISE",
     "NORMALS",
     "SAMPLE",
-    "SYSTEM_PACKAGES",
     "build_crop",
     "build_denoise",
     "build_normals",
     "build_sample",
-    "load_open3d",
 ]
 
 
 _XYZ: Final = LayerColumn("xyz", None, "(rows, 3)", "m", "coordinates, map frame, in the source's order")
 _SOURCE_COLUMNS: Final = (_XYZ, LayerColumn("*", None, "as in the source", "", "every other field"))
 _QUERIES_PER_BATCH: Final = 1 << 16
-SYSTEM_PACKAGES: Final = (
-    "libegl1", "libgl1", "libx11-6", "libusb-1.0-0",
-    *(() if platform.machine() == "x86_64" else ("libgfortran5",)),  # Open3D for other machines links to it
-)  # fmt: skip
-"""Packages of Debian and Ubuntu that Open3D needs on a machine without a desktop."""
 
 
 def build_crop(points: PointTable, parameters: Parameters) -> LayerTable:
@@ -259,37 +252,3 @@ def _local_coordinates(points: PointTable, finite: NDArray[np.bool_]) -> NDArray
     halo = points.halo[np.isfinite(points.halo).all(axis=1)].astype(np.float64)
     local: NDArray[np.float64] = np.concatenate([own, halo]) - own[:1]
     return local
-
-
-def load_open3d(purpose: str) -> Any:
-    """Return the open3d module; its first import in a process takes 1-2 s and 100-200 MB.
-
-    Parameters
-    ----------
-    purpose
-        The user of Open3D, as the subject of a sentence: ``"the layer normals"``.
-
-    Raises
-    ------
-    PackageMissing
-        Open3D or a package that it needs is not installed; the hint shows how to install it.
-    ShmmapError
-        Open3D cannot be loaded; the hint names what the system lacks.
-    """
-    try:
-        import open3d
-    except ModuleNotFoundError as error:
-        cpu_only = "open3d-cpu" if platform.machine() == "x86_64" else "open3d"  # as in pyproject.toml
-        package = cpu_only if error.name == "open3d" else error.name
-        raise PackageMissing(
-            f"{purpose} needs the Python package Open3D, which is not installed"
-            if error.name == "open3d"
-            else f"{purpose} needs the Python package Open3D, which lacks the package {package}",
-            hint=f"pip install {package}",
-        ) from error
-    except ImportError as error:
-        raise ShmmapError(
-            f"{purpose} needs the Python package Open3D, which cannot be loaded: {error}",
-            hint=f"it needs the system packages {' '.join(SYSTEM_PACKAGES)}",
-        ) from error
-    return open3d

@@ -7,9 +7,11 @@ import dataclasses
 import json
 import os
 import time
+import unicodedata
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shmmap.errors import MapDataError, MapMissing
 from shmmap.formats.cloud import cloud_suffix
@@ -25,7 +27,14 @@ from shmmap.origin.catalogue_bytes import (
 )
 from shmmap.origin.cell_names import base_names
 from shmmap.origin.directory_scan import ScannedFiles, scan
-from shmmap.origin.map_layout import MapLayout, OpenedDirectories, absolute_path, find_layout
+from shmmap.origin.map_layout import (
+    MapLayout,
+    OpenedDirectories,
+    absolute_path,
+    divided_beside,
+    find_layout,
+    yaml_files,
+)
 from shmmap.origin.map_report import read_map_frame
 from shmmap.origin.metadata import (
     MAX_METADATA_BYTES,
@@ -165,7 +174,7 @@ class MapDirectory:
                 hint="a divided map is a directory of PCD files; `shmmap divide` makes one of other clouds",
             )
         if layout.metadata is None:
-            return _without_metadata(files)
+            return _without_metadata(files, layout.root, opened)
         entries = parse_metadata(data, path=layout.metadata, strict=self.strict)
         del data  # with ten million cells it is the largest table of all
         catalogue = _joined(layout, layout.metadata, files, entries, strict=self.strict)
@@ -182,13 +191,16 @@ def _status(path: str, opened: OpenedDirectories) -> os.stat_result:
         raise MapMissing(f"cannot read {path}: {error.strerror}") from error
 
 
-def _without_metadata(files: ScannedFiles) -> Catalogue:
+def _without_metadata(files: ScannedFiles, root: str, opened: OpenedDirectories) -> Catalogue:
     if len(files.names) > 1:
+        lists = yaml_files([root, os.path.dirname(root)], opened)
+        named = f" (is it {' or '.join(lists[:3])}?)" if lists else ""
         raise MapDataError(
             f"{len(files.names)} PCD files but no pointcloud_map_metadata.yaml, in or beside it",
             path=files.prefix,
             cause="no_metadata",
-            hint="name the metadata file, or one of the PCD files to serve it alone",
+            hint=f"name the metadata file with --metadata FILE{named}, or one of the PCD files to serve it"
+            " alone",
         )
     return load_single_pcd(files.prefix + os.fsdecode(bytes(files.names[0])))
 
@@ -200,13 +212,9 @@ def _joined(
     if not len(entries.names):
         raise MapDataError("it lists no cells", path=metadata, cause="no_cells")
     bases = base_names(files.names)
-    order = np.argsort(entries.names, kind="stable")
-    ascending = entries.names[order]
-    at = np.minimum(ascending.searchsorted(bases), len(ascending) - 1)
-    has_entry = ascending[at] == bases
-    entry = order[at[has_entry]]
-    lacks_file = np.ones(len(entries.names), dtype=np.bool_)
-    lacks_file[entry] = False
+    entry, has_entry, lacks_file = _matched(entries.names, bases)
+    if lacks_file.any() and not has_entry.all():  # macOS and some archives decompose accents
+        entry, has_entry, lacks_file = _matched(_composed(entries.names), _composed(bases))
     problems = [*files.problems, *(f"{metadata}: {text}" for text in entries.problems)]
     if lacks_file.any():
         listed = list_some([os.fsdecode(name) for name in entries.names[lacks_file].tolist()])
@@ -215,6 +223,7 @@ def _joined(
                 f"these entries have no file in {layout.root}: {listed}",
                 path=metadata,
                 cause="missing_files",
+                hint=_divided_hint(layout.root),
             )
         problems.append(f"{metadata}: entries whose file is missing, not served: {listed}")
     names, stamps = files.names, files.stamps
@@ -235,6 +244,34 @@ def _joined(
         stamps=stamps,
         problems=problems,
     )
+
+
+def _matched(
+    entries: NDArray[np.bytes_], bases: NDArray[np.bytes_]
+) -> tuple[NDArray[np.intp], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return the entry of each file that has one, which files have one, and which entries have no file."""
+    order = np.argsort(entries, kind="stable")
+    ascending = entries[order]
+    at = np.minimum(ascending.searchsorted(bases), len(ascending) - 1)
+    has_entry = ascending[at] == bases
+    entry = order[at[has_entry]]
+    lacks_file = np.ones(len(entries), dtype=np.bool_)
+    lacks_file[entry] = False
+    return entry, has_entry, lacks_file
+
+
+def _composed(names: NDArray[np.bytes_]) -> NDArray[np.bytes_]:
+    """Return names with accents composed (Unicode's form NFC)."""
+    texts = (os.fsdecode(name) for name in names.tolist())
+    return np.array([os.fsencode(unicodedata.normalize("NFC", text)) for text in texts], np.bytes_)
+
+
+def _divided_hint(path: str) -> str:
+    """Return a hint to the folder beside one file that holds the map in cells; empty if there is none."""
+    if not os.path.isfile(path):
+        return ""
+    folders = divided_beside(path)
+    return f"the map in cells seems to be {' or '.join(folders[:3])}: name that" if folders else ""
 
 
 MAX_SINGLE_PCD_BYTES = 256 << 20
@@ -301,5 +338,5 @@ def _refuse_large(path: str, what: str, size: int, limit: int) -> None:
             f"{size / 2**20:.0f} MiB of {what}; a map of one file without metadata may have {limit >> 20}",
             path=path,
             cause="needs_dividing",
-            hint="divide it into cells: shmmap divide",
+            hint=_divided_hint(path) or "divide it into cells: shmmap divide",
         )

@@ -23,14 +23,23 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
 from shmmap.errors import MapDataError, MapMissing
 from shmmap.segment.process_limits import raise_limit_behind
 
-__all__ = ["KUBERNETES_LINK", "MapLayout", "OpenedDirectories", "absolute_path", "find_layout", "is_pcd"]
+__all__ = [
+    "KUBERNETES_LINK",
+    "MapLayout",
+    "OpenedDirectories",
+    "absolute_path",
+    "divided_beside",
+    "find_layout",
+    "is_pcd",
+    "yaml_files",
+]
 
 KUBERNETES_LINK: Final = "..data"
 """In a Kubernetes volume, every visible name is a link through this link, which is switched atomically."""
@@ -218,3 +227,27 @@ def _holds_pcd(directory: str) -> bool:
     except OSError as error:
         raise_limit_behind(error)
         return False
+
+
+def divided_beside(path: str) -> list[str]:
+    """Return the folders beside a file that hold PCD files: a map may be there both whole and in cells."""
+    folder = os.path.dirname(path)
+    return [other for name in _listed(folder) if _holds_pcd(other := os.path.join(folder, name))]
+
+
+def yaml_files(folders: Iterable[str], opened: OpenedDirectories) -> list[str]:
+    """Return the YAML files in folders that may be metadata under a name of their own."""
+    return [
+        os.path.join(folder, name)
+        for folder in folders
+        for name in _listed(opened.at(folder))
+        if name.lower().endswith((".yaml", ".yml"))
+    ]
+
+
+def _listed(directory: str) -> list[str]:
+    try:
+        return sorted(os.listdir(directory))
+    except OSError as error:
+        raise_limit_behind(error)
+        return []

@@ -114,6 +114,7 @@ COUNTERS: Final = (
     Counter("loads_started", "counter", "", "Loads handed to a worker"),
     Counter("loads_finished", "counter", "", "Loads that ended with a published segment"),
     Counter("loads_failed", "counter", "", "Loads that ended with an error"),
+    Counter("unloadable", "gauge", "", "Cells' layers that could not be loaded when last tried"),
     Counter("loads_timed_out", "counter", "", "Loads stopped at their deadline"),
     Counter("bytes_loaded", "counter", "bytes", "Segment bytes published"),
     Counter("workers", "gauge", "", "Loader processes that are alive"),

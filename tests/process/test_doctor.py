@@ -10,8 +10,8 @@ from typing import Any
 
 import shmmap
 from tests.process.conftest import DaemonFactory
-from tests.support.command_line import doctor
-from tests.support.daemon_process import DaemonProcess, Deadline
+from tests.support.command_line import doctor, health, verb
+from tests.support.daemon_process import DaemonProcess, Deadline, until
 from tests.support.divided_map import DividedMap
 
 
@@ -51,22 +51,33 @@ def test_from_health_to_death(daemon: DaemonFactory, divided_map: DividedMap) ->
 
 
 def test_cells_that_cannot_be_loaded_are_named(daemon: DaemonFactory, divided_map: DividedMap) -> None:
-    path = Path(divided_map.id("0_0.pcd"))
+    path, other = (Path(divided_map.id(name)) for name in ("0_0.pcd", "0_20.pcd"))
     whole = path.read_bytes()
     path.write_bytes(b"no point cloud")
+    other.write_bytes(b"no point cloud")
     one = daemon(divided_map.root)
     assert doctor(one)[1]["cells"]["fact"] == "no load has failed"
+    assert health(one)[0] == 0
     with shmmap.connect(one.endpoint, shm_dir=one.shm_dir) as client:
-        assert client.selected([str(path)], wait=20.0).failed
-        found = _until(one, "cells", "warn")
-        assert found["fact"].startswith("1 cell cannot be loaded: 0_0.pcd (points): ")
-        assert "shmmap inspect" in found["advice"]
+        assert client.selected([str(path), str(other)], layers=["points", "ground"], wait=20.0).failed
+        assert _until(one, "cells", "fail")["advice"].startswith(f"`shmmap inspect {path}` reads")
+        code, found = doctor(one)
+        fact = found["cells"]["fact"]
+        assert code == 1, "the exit code is that of a failure"
+        assert fact.startswith("2 cells cannot be loaded: 0_0.pcd (points) and 3 more: ")
+        assert fact.count("not a PCD file") == 1, "each cause once"
+        code, text = health(one)
+        assert (code, text.split(":")[0]) == (1, "unhealthy"), "the first word is that of the exit code"
+        assert text.splitlines()[1] == f"  {fact}"
+        assert verb(one, "health")[1].startswith("healthy: ")
 
         path.write_bytes(whole)
-        client.reload()
-        assert client.selected([str(path)], wait=20.0).complete
-    found = _until(one, "cells", "ok")
-    assert found["fact"].endswith("no cell is known to fail now")
+        client.reload()  # another state of the file: what failed before says nothing of it
+        until(lambda: health(one)[1].splitlines()[1].startswith("  1 cell cannot be loaded: 0_20.pcd"))
+        other.write_bytes(whole)
+        assert client.selected([str(path), str(other)], layers=["points", "ground"], wait=20.0).complete
+    until(lambda: health(one)[0] == 0)
+    assert _until(one, "cells", "ok")["fact"].endswith("no cell is known to fail now")
 
 
 def _until(one: DaemonProcess, about: str, state: str) -> dict[str, Any]:

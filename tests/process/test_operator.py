@@ -269,3 +269,20 @@ def test_top_leaves_the_terminal_as_it_was(shmmap: Shmmap, number: signal.Signal
     finally:
         os.close(ours)
         os.close(theirs)
+
+
+@pytest.mark.parametrize(("verb", "shown"), [("top", b"no client is connected"), ("tail", b"the daemon is")])
+def test_a_terminal_that_is_gone_ends_what_shows_without_end(shmmap: Shmmap, verb: str, shown: bytes) -> None:
+    ours, theirs = pty.openpty()
+    environment = shmmap.environment | {"TERM": "xterm-256color", "COLUMNS": "100", "LINES": "40"}
+    with subprocess.Popen(
+        [sys.executable, "-m", "shmmap.cli", verb],
+        env=environment, stdin=subprocess.DEVNULL, stdout=theirs, stderr=subprocess.PIPE,
+        start_new_session=True,  # which has no terminal of its own: no SIGHUP comes
+    ) as program:  # fmt: skip
+        os.close(theirs)
+        read_until(ours, shown)
+        os.close(ours)
+        assert program.wait(DEADLINE_S) == 141
+        assert program.stderr is not None
+        assert program.stderr.read() == b""

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 import warnings
@@ -86,7 +87,7 @@ def test_failed_cells(daemon: Factory, divided_map: DividedMap, tmp_path: Path) 
             assert window.move_to(1.0, 1.0).failed, "a window says it in its update"
 
 
-def test_pending_cells(served: DaemonProcess) -> None:
+def test_pending_cells(served: DaemonProcess, tmp_path: Path) -> None:
     """One that is loaded, three that no loader loads in time."""
     with shmmap.connect(served.endpoint) as client:
         assert client.selected("0_0.pcd", wait=60).complete
@@ -95,8 +96,16 @@ def test_pending_cells(served: DaemonProcess) -> None:
             cells = client.around(1, 1, 5, wait=0.2)
         lines = str(caught[0].message).splitlines()
         assert lines[0] == "1 of 4 cells are there:"
-        assert sorted(lines[1:]) == sorted(f"pending: {one.id} (points)" for one in cells.pending)
-        assert len(lines) == 4
+        assert sorted(lines[1:-1]) == sorted(f"pending: {one.id} (points)" for one in cells.pending)
+        assert (
+            lines[-1]
+            == "hint: what is pending is still being loaded: ask again, or wait longer: wait=SECONDS"
+        )
+        assert len(lines) == 5
+        done = Shmmap(served, tmp_path).run("query", "--circle", "1,1,5", "--wait", "0.2")
+        assert done.returncode == 1
+        said = r"shmmap: 3 layers of cells are still pending after 0\.2 s: .*\d+ loaders?.*\n"
+        assert re.match(said + r"hint: .* wait longer: --wait SECONDS", done.stderr), done.stderr
         with pytest.raises(LoadTimeout, match=r"still being loaded, and 2 more \(ask again, or wait longer"):
             client.around(1, 1, 5, wait=0.2, strict=True)
         assert len(client.around(1, 1, 5, wait=None).pending) == 3, "no request waited for them"

@@ -88,7 +88,7 @@ def programs_or_skip(*names: str) -> None:
 
 def open3d_or_skip() -> Any:
     """Return Open3D's module; skip the test where it cannot be loaded."""
-    from shmmap.layers.selections import SYSTEM_PACKAGES
+    from shmmap.open3d_loading import SYSTEM_PACKAGES
 
     reason = f"Open3D, or one of {' '.join(SYSTEM_PACKAGES)} that it needs, is missing"
     return pytest.importorskip("open3d", reason=reason, exc_type=ImportError)

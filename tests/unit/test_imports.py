@@ -35,6 +35,7 @@ BASE = {
     "lacking",
     "kernel_cache",
     "compile_notices",
+    "open3d_loading",
     "compiling",
     "large_tables",
     "disk_budget",
@@ -61,6 +62,7 @@ PARTS = {
     "kernel_cache": {"logfmt", "private_directory", "version"},
     "compile_notices": {"logfmt"},
     "compiling": {"compile_notices", "kernel_cache", "version"},
+    "open3d_loading": {"errors"},
     "version": set[str](),
     "mounts": set[str](),
     "progress": set[str](),
@@ -79,6 +81,7 @@ PARTS = {
     "client": {
         "errors", "columns", "failpoints", "geometry", "lacking", "lazy_imports", "chunks",
         "segment", "protocol", "statistics.layout",
+        "open3d_loading",
     },
     "daemon": BASE | {
         "chunks", "formats", "segment", "protocol", "statistics", "layers", "origin", "dividing",

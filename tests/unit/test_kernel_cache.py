@@ -96,9 +96,11 @@ def test_compiling_is_noticed_and_loading_is_not(
 
     monkeypatch.setattr(compile_notices, "_watchers", [])
     compile_notices.watch(show)
-    kernel.module.write_text(SOURCE + SOURCE.partition("\n\n")[2].replace("doubled", "again"))
-    assert [kernel.hits(), kernel.hits()] == [0, 1]
-    assert seen == [("doubling", 1, 2), ("doubling", 2, 2)]
+    two_types = "compiled(types.int64(types.int64), types.float64(types.float64))"
+    again = SOURCE.partition("\n\n")[2].replace("doubled", "again")
+    kernel.module.write_text(SOURCE.replace("compiled(types.int64(types.int64))", two_types) + again)
+    assert [kernel.hits(), kernel.hits()] == [0, 2]
+    assert seen == [("doubling", 1, 2), ("doubling", 2, 2)], "a kernel once, for all its types"
     assert capsys.readouterr().err == (
         "shmmap-ndt: compiling kernels, once for this version: doubling, 1 of 2\n"
     )

@@ -29,7 +29,8 @@ class RoughPose:
     ----------
     x, y
     z
-        Height, used only if the map has no ground near the position; else the ground's height is used.
+        Height of the scan's frame; None: unknown.  The pose's height is that of the map's ground, where there
+        are several (bridges, tunnels, car parks) of the one that is clearly nearest to z.
     roll, pitch, yaw
     sigma_m
         Standard deviation of x and of y.
@@ -41,7 +42,7 @@ class RoughPose:
 
     x: float
     y: float
-    z: float = 0.0
+    z: float | None = None
     roll: float = 0.0
     pitch: float = 0.0
     yaw: float = 0.0
@@ -50,7 +51,7 @@ class RoughPose:
     covariance: tuple[tuple[float, ...], ...] | None = None
 
     def __post_init__(self) -> None:
-        numbers = (self.x, self.y, self.z, self.roll, self.pitch, self.yaw)
+        numbers = (self.x, self.y, self.z or 0.0, self.roll, self.pitch, self.yaw)
         if not all(map(math.isfinite, numbers)):
             raise BadRequest(f"a rough pose has finite numbers, not {numbers}")
         if not (0 < self.sigma_m < math.inf and self.sigma_yaw > 0):

@@ -49,6 +49,8 @@ JSON (fields may be added, none is removed):
   {{"T_map_base": 4x4 in metres, "score": transform probability, "nvtl",
    "reliable", "converged", "no_map": bool, "failed_limits": [name],
    "ground_z": height of the map's ground there, or null,
+   "grounds": [heights of all grounds at the rough pose], "level_doubt": text
+   or null,
    "evidence": {{"points": matched, "distance": metres, "angle": degrees,
      "sharpness", "spread"}},
    "covariance": 6x6 of x y z roll pitch yaw, or null,
@@ -57,7 +59,8 @@ JSON (fields may be added, none is removed):
    "too_near", "not_finite": points of the scan left out}}
   Where there is no map, "no_map" is true and the others are null, false, 0 or
   empty.
-{FAILED_LIMITS}
+{FAILED_LIMITS} Here also level: the map has several
+grounds there (a bridge, a car park), and which one is in doubt.
 Exit code: 0; 1 when the pose is not reliable, or there is no map around it."""
 
 
@@ -79,7 +82,8 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     add_pose_option(
         parser,
         "--pose",
-        "rough pose; the height comes from the map's ground, and from its z only where there is none near",
+        "rough pose; the height comes from the map's ground, of several above each other from that which is"
+        " clearly nearest to z (with --pose-format xyyaw, each is tried)",
         required=True,
     )
     add_pose_format_option(parser)
@@ -108,7 +112,8 @@ def _run(args: argparse.Namespace) -> int:
     from shmmap_clients.scans.scan_file import thinned
 
     x, y, z, roll, pitch, yaw = pose_from_matrix(pose_from(args, "--pose")).tolist()
-    rough = RoughPose(x, y, z, roll, pitch, yaw, sigma_m=args.sigma, sigma_yaw=args.sigma_yaw)
+    known_z = None if args.pose_format == "xyyaw" else z
+    rough = RoughPose(x, y, known_z, roll, pitch, yaw, sigma_m=args.sigma, sigma_yaw=args.sigma_yaw)
     rules = InitializerRules(
         map_radius=args.map_radius,
         leaf=args.leaf,
@@ -136,6 +141,7 @@ def _run(args: argparse.Namespace) -> int:
         print_json(_document(found, reader.counts))
     else:
         failed = [initializer.trust.describe(name) for name in found.result.failed_limits]
+        failed += [] if found.level_doubt is None else [found.level_doubt]
         _print(found, args.pose_format, failed, reader.left_out)
     return 0 if found.reliable else 1
 
@@ -151,8 +157,10 @@ def _document(found: InitialPose | None, left_out: dict[str, int]) -> dict[str, 
         "reliable": found is not None and found.reliable,
         "converged": result is not None and result.converged,
         "no_map": result is None or result.no_map,
-        "failed_limits": ["no_map"] if result is None else list(result.failed_limits),
+        "failed_limits": ["no_map"] if found is None else list(found.failed_limits),
         "ground_z": None if found is None else found.ground_z,
+        "grounds": [] if found is None else list(found.grounds),
+        "level_doubt": None if found is None else found.level_doubt,
         "evidence": None if result is None else asdict(result.evidence),
         "covariance": None if covariance is None else covariance.tolist(),
         "alternatives": [
@@ -174,7 +182,9 @@ def _print(found: InitialPose, pose_format: str, failed: list[str], left_out: st
         print("  " + " ".join(f"{value:12.6f}" for value in row))
     verdict = "reliable" if found.reliable else f"NOT reliable ({', '.join(failed)})"
     print(f"score         {found.score:.3f}, NVTL {result.nvtl:.3f}: {verdict}")
-    print(f"ground        {'none near' if found.ground_z is None else f'{found.ground_z:.3f} m'}")
+    others = [f"{z:.1f}" for z in found.grounds if found.ground_z is not None and abs(z - found.ground_z) > 1]
+    also = f"; also at {', '.join(others)} m" if others else ""
+    print(f"ground        {'none near' if found.ground_z is None else f'{found.ground_z:.3f} m{also}'}")
     for one in found.alternatives:
         x, y, z = one.T_map_base[:3, 3]
         print(f"alternative   ({x:.2f}, {y:.2f}, {z:.2f}) score {one.score:.3f}, NVTL {one.nvtl:.3f}")

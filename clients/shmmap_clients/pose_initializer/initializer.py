@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Initialization of a pose: map around the rough pose, height of the ground, candidates, alignments."""
+"""Initialization of a pose: map around the rough pose, heights of its grounds, candidates, alignments."""
 
 from __future__ import annotations
 
 import math
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Any, Final, NoReturn
@@ -32,6 +32,13 @@ from shmmap_clients.ndt_scan_matcher import (
     pose_from_matrix,
 )
 from shmmap_clients.pose_initializer.candidates import ParzenEstimator, RoughPose
+from shmmap_clients.pose_initializer.grounds import (
+    Ground,
+    flat_pieces,
+    ground_at,
+    grounds_of,
+    levels_of,
+)
 
 __all__ = ["Alternative", "InitialPose", "InitializerRules", "PoseInitializer", "Relocalizer"]
 
@@ -39,8 +46,11 @@ _APART_M: Final = 1.0
 _APART_YAW: Final = math.radians(10.0)
 _SEED_APART_M: Final = 0.5
 _SEED_APART_YAW: Final = math.radians(3.0)
-_SAME_HEIGHT_M: Final = 0.3
 _DOUBLINGS: Final = 3
+_GROUND_REACH_M: Final = 4.0
+_MAX_GROUND_REACH_M: Final = 12.0
+_BOTH_FIT: Final = 0.7  # of the best score
+_NUMBERS: Final = ("no", "one", "two", "three", "four", "five")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,10 +82,15 @@ class InitialPose:
     score
         Transform probability of the alignment, over all points, including those without map.
     reliable
-        Whether the result meets all limits of trust.
+        Whether the result meets all limits of trust, and its level is beyond doubt.
     ground_z
-        Height of the map's ground below the pose, metres: the better of the two heights that the search
-        tries; None if there is no ground near.
+        Height of the map's ground below the pose, metres: of the heights that the search tries the one that
+        the pose fits; None if there is no ground near.
+    grounds
+        Heights of all grounds at the rough pose, lowest first, metres: several on bridges, above tunnels, and
+        in car parks.
+    level_doubt
+        Why the pose may be on another ground; None: it is not in doubt.
     alternatives
         Other poses, best first, at least a metre or ten degrees from the best and from each other.
     candidates
@@ -88,10 +103,17 @@ class InitialPose:
     score: float
     reliable: bool
     ground_z: float | None
+    grounds: tuple[float, ...]
+    level_doubt: str | None
     alternatives: tuple[Alternative, ...]
     candidates: int
     map_s: float
     search_s: float
+
+    @property
+    def failed_limits(self) -> tuple[str, ...]:
+        """Names of the result's failed limits, and ``level`` if that is in doubt; none if reliable."""
+        return self.result.failed_limits + (() if self.level_doubt is None else ("level",))
 
     @property
     def T_map_base(self) -> NDArray[np.float64]:  # noqa: N802
@@ -140,6 +162,11 @@ class InitializerRules:
     def __post_init__(self) -> None:
         if min(self.candidates, self.starts, self.finals, self.scoring_points) < 1:
             raise BadRequest("numbers of candidates, starts, finals and points must be positive")
+
+    def batches(self, effort: int = 1) -> list[int]:
+        """Return the numbers of candidates to draw: from the rough pose, then four times where good."""
+        half = max(1, self.candidates // 2)
+        return [half * effort, *_split(self.candidates - half, 4)]
 
 
 class PoseInitializer:
@@ -238,12 +265,55 @@ class PoseInitializer:
             The daemon cannot be reached.
         """
         began = time.perf_counter()
+        if rough.z is None and self.rules.height is None:
+            raise BadRequest("a search without the map's ground needs the rough pose's z")
         self._take_map(rough)
         had_map = time.perf_counter()
+        grounds = self._grounds(rough)
+        searched = self._search_grounds(points, rough, grounds, effort)
+        found = sorted((one for results in searched.values() for one in results), key=_by_score)
+        apart = _apart(found)
+        best, doubt = apart[0], None
+        if len(grounds) > 1 and self.rules.height is not None:
+            best, doubt = self._choose(rough, grounds, searched, apart)
+        return InitialPose(
+            result=best,
+            score=best.transform_probability,
+            reliable=best.trustworthy and doubt is None,
+            ground_z=self._ground_below(best, grounds),
+            grounds=tuple(ground.z for ground in grounds),
+            level_doubt=doubt,
+            alternatives=tuple(
+                Alternative(one.T_map_base, one.transform_probability, one.nvtl)
+                for one in _apart([best, *apart])[1:]
+            ),
+            candidates=sum(self.rules.batches(effort)) * len(searched),
+            map_s=had_map - began,
+            search_s=time.perf_counter() - had_map,
+        )
+
+    def _search_grounds(
+        self, points: NDArray[np.floating], rough: RoughPose, grounds: Sequence[Ground], effort: int
+    ) -> dict[Ground | None, list[Result]]:
+        """Return the best alignments of each ground searched, the best first; None: without the map's ground.
+
+        The ground that the rough z means is searched alone, if the scan fits there.
+        """
         height = self.rules.height
-        # the rough z is a guess from GNSS; the map's ground is known to centimetres
-        grounds = self._grounds(rough.x, rough.y)
-        heights = [z + height for z in grounds] if height is not None and grounds else [rough.z]
+        if height is None or not grounds:
+            return {None: self._search(points, rough, [rough.z or 0.0], effort)}
+        searched: dict[Ground | None, list[Result]] = {}
+        meant = self._meant(rough, grounds)
+        for ground in sorted(grounds, key=lambda one: one != meant):
+            searched[ground] = self._search(points, rough, [z + height for z in ground.heights], effort)
+            if ground == meant and self._fits(searched[ground][0], ground, grounds):
+                break
+        return searched
+
+    def _search(
+        self, points: NDArray[np.floating], rough: RoughPose, heights: Sequence[float], effort: int
+    ) -> list[Result]:
+        """Return the best alignments from candidates at the one of these heights that scores best."""
 
         def pose_of(candidate: NDArray[np.float64], z: float) -> NDArray[np.float64]:
             x, y, yaw = candidate
@@ -254,35 +324,61 @@ class PoseInitializer:
             return np.array([at.score for at in self._coarse.evaluate(points, poses)])
 
         estimator = ParzenEstimator(rough, self.rules.seed)
-        half = max(1, self.rules.candidates // 2)
-        batches = [half * effort, *(_split(self.rules.candidates - half, 4))]
-        first = estimator.first(batches[0])
+        first_size, *sizes = self.rules.batches(effort)
+        first = estimator.first(first_size)
         by_height = [scores(first, z) for z in heights]
         best_height = int(np.argmax([one.max() for one in by_height]))
         z = heights[best_height]
         estimator.learn(first, by_height[best_height])
-        for size in batches[1:]:
+        for size in sizes:
             batch = estimator.next(size)
             estimator.learn(batch, scores(batch, z))
         starts = estimator.best(self.rules.starts, _SEED_APART_M, _SEED_APART_YAW)
         near = self._coarse.align_many(points, [matrix_from_pose(pose_of(start, z)) for start in starts])
-        near.sort(key=lambda result: -result.transform_probability)
+        near.sort(key=_by_score)
         finals = self._fine.align_many(points, [one.T_map_base for one in _apart(near)[: self.rules.finals]])
-        finals.sort(key=lambda result: -result.transform_probability)
-        best = finals[0]
-        others = [
-            Alternative(one.T_map_base, one.transform_probability, one.nvtl) for one in _apart(finals)[1:]
-        ]
-        return InitialPose(
-            result=best,
-            score=best.transform_probability,
-            reliable=best.trustworthy,
-            ground_z=self._ground_below(best.T_map_base),
-            alternatives=tuple(others),
-            candidates=sum(batches),
-            map_s=had_map - began,
-            search_s=time.perf_counter() - had_map,
-        )
+        return sorted(finals, key=_by_score)
+
+    def _choose(
+        self,
+        rough: RoughPose,
+        grounds: Sequence[Ground],
+        searched: Mapping[Ground | None, list[Result]],
+        apart: Sequence[Result],
+    ) -> tuple[Result, str | None]:
+        """Return the best result, and why its ground is in doubt, where there are several."""
+        several = _several(grounds)
+        meant = self._meant(rough, grounds)
+        if meant is not None:
+            there = searched[meant][0]
+            if self._fits(there, meant, grounds):
+                return there, None
+            other = self._ground_of(apart[0], grounds)
+            if other == meant or not apart[0].trustworthy:
+                return apart[0], None
+            return apart[0], (
+                f"{several}: the rough z means the one at {meant.z:.1f} m,"
+                f" the scan fits the one at {other.z:.1f} m"
+            )
+        best = apart[0]
+        least = _BOTH_FIT * best.transform_probability
+        fitting = {
+            self._ground_of(one, grounds).z
+            for one in apart
+            if one.trustworthy and one.transform_probability >= least
+        }
+        if len(fitting) < 2:
+            return best, None
+        return best, f"{several}: the scan fits {'both' if len(grounds) == 2 else _listed(sorted(fitting))}"
+
+    def _meant(self, rough: RoughPose, grounds: Sequence[Ground]) -> Ground | None:
+        """Return the ground on which the rough z is, if that can be said."""
+        if rough.z is None or self.rules.height is None:
+            return None
+        return ground_at(grounds, rough.z - self.rules.height)
+
+    def _fits(self, result: Result, ground: Ground, grounds: Sequence[Ground]) -> bool:
+        return result.trustworthy and self._ground_of(result, grounds) == ground
 
     @property
     def trust(self) -> TrustLimits:
@@ -294,27 +390,38 @@ class PoseInitializer:
         """Reason why the fallback computes; None while it does not."""
         return self._coarse.fault or self._fine.fault
 
-    def _grounds(self, x: float, y: float) -> list[float]:
-        """Return heights of the ground to try: the median, then the lowest if it differs.
+    def _grounds(self, rough: RoughPose) -> list[Ground]:
+        """Return the grounds at the rough pose, lowest first.
 
-        If the rough pose is beside the street, more than half of the columns may be above the ground.
+        Heights of the ``ground`` layer are the median, and the lowest: if the rough pose is beside the
+        street, more than half of the columns may be above the ground.
         """
         cells = [cell for cell in self._window.cells if cell.layer == self._ground]
         grids = [(cell["min"], cell.header.lattice) for cell in cells]
         known = [(low, lattice) for low, lattice in grids if lattice is not None]
-        median, lowest = ground_height(known, x, y), ground_height(known, x, y, rule="min")
-        if median is None or lowest is None:
-            return []
-        return [median] if abs(lowest - median) < _SAME_HEIGHT_M else [median, lowest]
+        spread = float(np.linalg.norm(rough.factor[:2], axis=1).max())
+        reach_m = min(_GROUND_REACH_M + 2.0 * spread, _MAX_GROUND_REACH_M)
+        pieces, columns = flat_pieces(self._map.cells.values(), rough.x, rough.y, reach_m)
+        return grounds_of(
+            ground_height(known, rough.x, rough.y),
+            ground_height(known, rough.x, rough.y, rule="min"),
+            levels_of(pieces, columns),
+        )
 
-    def _ground_below(self, T_map_base: NDArray[np.float64]) -> float | None:
-        """Return the tried height of the ground that fits a pose best."""
-        x, y, z = T_map_base[:3, 3].tolist()
-        grounds = self._grounds(x, y)
-        if self.rules.height is None:
-            return grounds[0] if grounds else None
-        stands_at = z - self.rules.height
-        return min(grounds, key=lambda ground: abs(ground - stands_at), default=None)
+    def _ground_of(self, result: Result, grounds: Sequence[Ground]) -> Ground:
+        """Return the ground on which a result's pose is."""
+        stands_at = self._stands_at(result)
+        return min(grounds, key=lambda ground: min(abs(z - stands_at) for z in ground.heights))
+
+    def _stands_at(self, result: Result) -> float:
+        return float(result.T_map_base[2, 3]) - (self.rules.height or 0.0)
+
+    def _ground_below(self, result: Result, grounds: Sequence[Ground]) -> float | None:
+        """Return the tried height of the ground that a result's pose fits best."""
+        if not grounds:
+            return None
+        stands_at = self._stands_at(result)
+        return min(self._ground_of(result, grounds).heights, key=lambda z: abs(z - stands_at))
 
     def _take_map(self, rough: RoughPose) -> None:
         """Fetch the map around a position."""
@@ -357,6 +464,22 @@ class PoseInitializer:
         )
 
 
+def _by_score(result: Result) -> float:
+    """Order the best results first."""
+    return -result.transform_probability
+
+
+def _several(grounds: Sequence[Ground]) -> str:
+    """Return their number and heights, as "two grounds, -1.9 and 6.1 m"."""
+    count = _NUMBERS[len(grounds)] if len(grounds) < len(_NUMBERS) else str(len(grounds))
+    return f"{count} grounds, {_listed([ground.z for ground in grounds])}"
+
+
+def _listed(heights: Sequence[float]) -> str:
+    *first, last = (f"{round(z, 1) + 0.0:.1f}" for z in heights)  # + 0.0: no -0.0
+    return f"{', '.join(first)} and {last} m" if first else f"{last} m"
+
+
 def _split(count: int, parts: int) -> list[int]:
     sizes = [count * (part + 1) // parts - count * part // parts for part in range(parts)]
     return [size for size in sizes if size]
@@ -390,6 +513,8 @@ class Relocalizer:
         search.
     sigma_m, sigma_yaw
         Standard deviation of x and y, metres, and of the heading, radians, at the first attempt.
+    knows_z
+        Whether the height of the first predicted pose is known; after a success it is.
 
     Attributes
     ----------
@@ -398,12 +523,18 @@ class Relocalizer:
     """
 
     def __init__(
-        self, initializer: Callable[[], PoseInitializer], *, sigma_m: float = 2.0, sigma_yaw: float = 0.1745
+        self,
+        initializer: Callable[[], PoseInitializer],
+        *,
+        sigma_m: float = 2.0,
+        sigma_yaw: float = 0.1745,
+        knows_z: bool = True,
     ) -> None:
         self._make = initializer
         self._initializer: PoseInitializer | None = None
         self._sigma_m = sigma_m
         self._sigma_yaw = sigma_yaw
+        self._knows_z = knows_z
         self._failures = 0
         self.error: ShmmapError | None = None
 
@@ -420,7 +551,14 @@ class Relocalizer:
         wider = 2 ** min(self._failures, _DOUBLINGS)
         x, y, z, roll, pitch, yaw = pose_from_matrix(T_guess).tolist()
         rough = RoughPose(
-            x, y, z, roll, pitch, yaw, sigma_m=self._sigma_m * wider, sigma_yaw=self._sigma_yaw * wider
+            x,
+            y,
+            z if self._knows_z else None,
+            roll,
+            pitch,
+            yaw,
+            sigma_m=self._sigma_m * wider,
+            sigma_yaw=self._sigma_yaw * wider,
         )
         self._failures += 1
         self.error = None
@@ -433,5 +571,5 @@ class Relocalizer:
             return None
         if not found.reliable:
             return None
-        self._failures = 0
+        self._failures, self._knows_z = 0, True
         return found.result

@@ -162,7 +162,9 @@ def _by_time(numbers: Sequence[str], trajectory: Trajectory) -> tuple[NDArray[np
     order = np.argsort(trajectory.stamps_s, kind="stable")
     stamps = trajectory.stamps_s[order]
     steps = np.diff(np.unique(stamps))
-    close = min(_CLOSEST_S, float(np.median(steps)) / 2) if len(steps) else _CLOSEST_S
+    close = _CLOSEST_S
+    if len(steps) and not _certain(numbers):  # counts are near to dense poses by chance
+        close = min(close, float(np.median(steps)) / 2)
     best = np.zeros(len(numbers), np.int64), np.zeros(len(numbers), np.bool_)
     for unit in _UNITS:
         times = np.array([float(word) * unit for word in numbers])

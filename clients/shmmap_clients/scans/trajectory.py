@@ -7,6 +7,7 @@ import math
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,14 @@ from shmmap.errors import MapMissing
 __all__ = ["Trajectory", "matrix_of", "pose_of", "quaternion_of", "read_route", "read_trajectory", "tum_line"]
 
 _NORM_TOLERANCE = 1e-2
+_UNITS: Final = (("seconds", 1.0), ("milliseconds", 1e-3), ("microseconds", 1e-6), ("nanoseconds", 1e-9))
+_CLOCK_S: Final = (5e8, 5e9)  # times of clocks: 1985 to 2128
+_SPARSE_S: Final = 30.0  # poses further apart are not those of a drive
+_LONGEST_STEP: Final = 2.0  # of seconds
+_SHORTEST_STEP: Final = 2e3  # of microseconds: 500 poses a second
+_COUNTED: Final = 1e6  # no drive has more frames
+_LYING: Final = math.cos(math.radians(60.0))
+_UPRIGHT: Final = math.cos(math.radians(20.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,10 +38,13 @@ class Trajectory:
         (N,) float64, seconds.
     T_map_sensor
         (N, 4, 4) float64, metres.
+    notes
+        What a user should know of how the file was read.
     """
 
     stamps_s: NDArray[np.float64]
     T_map_sensor: NDArray[np.float64]
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.stamps_s)
@@ -136,6 +148,9 @@ def _lines(name: str, cause: str) -> Iterator[tuple[int, str]]:
 def read_trajectory(path: str | os.PathLike[str]) -> Trajectory:
     """Read a TUM file; empty lines and lines that begin with ``#`` are skipped.
 
+    Times in milliseconds, microseconds or nanoseconds are recognised by their size or their steps.
+    `Trajectory.notes` says so, and where a unit or the order of the quaternions is in doubt.
+
     Raises
     ------
     MapMissing
@@ -158,7 +173,51 @@ def read_trajectory(path: str | os.PathLike[str]) -> Trajectory:
         poses.append(matrix_of(values[1:4], values[4:]))
     if not stamps:
         raise MapDataError(f"{name}: no poses", cause="trajectory")
-    return Trajectory(np.array(stamps), np.array(poses).reshape(-1, 4, 4))
+    seconds, note = _in_seconds(np.array(stamps), name)
+    T_map_sensor = np.array(poses).reshape(-1, 4, 4)
+    notes = (note, _order_of_quaternions(T_map_sensor, name))
+    return Trajectory(seconds, T_map_sensor, tuple(text for text in notes if text))
+
+
+def _in_seconds(stamps: NDArray[np.float64], name: str) -> tuple[NDArray[np.float64], str]:
+    """Return times in seconds, and a note if they were in another unit or it is in doubt."""
+    steps = np.diff(np.unique(stamps))
+    step = float(np.median(steps)) if len(steps) else 0.0
+    size = float(np.median(np.abs(stamps)))
+    low, high = _CLOCK_S
+    clock = [one for one in _UNITS if low <= size * one[1] < high and step * one[1] <= _SPARSE_S]
+    if clock:
+        unit, factor = clock[0]
+    elif step <= _LONGEST_STEP or (stamps % 1.0).any():
+        unit, factor = _UNITS[0]
+    elif step >= _SHORTEST_STEP:
+        unit, factor = _UNITS[3 if step >= 1e3 * _SHORTEST_STEP else 2]
+    elif float(np.abs(stamps).min()) >= _COUNTED:
+        unit, factor = _UNITS[1]
+    else:
+        return stamps, (
+            f"times in {name} are {step:g} apart and read as seconds;"
+            " if they are milliseconds or numbers of frames, no motion can be predicted: write seconds"
+        )
+    if factor == 1.0:
+        return stamps, ""
+    return stamps * factor, f"times in {name} are read as {unit}, {step * factor:.3g} s apart"
+
+
+def _order_of_quaternions(T_map_sensor: NDArray[np.float64], name: str) -> str:
+    """Return a note if the poses lie on their sides, but would be upright with w first in the file."""
+    up = T_map_sensor[:, 2, 2]
+    if np.count_nonzero(up < _LYING) * 10 < len(up):
+        return ""
+    # as read x y z w; with w first these four are w x y z
+    quaternions = np.array([quaternion_of(T[:3, :3]) for T in T_map_sensor])
+    up = 1.0 - 2.0 * (quaternions[:, 1] ** 2 + quaternions[:, 2] ** 2)
+    if np.count_nonzero(up > _UPRIGHT) * 100 < 99 * len(up):
+        return ""
+    return (
+        f"quaternions in {name} look like w first: read as qx qy qz qw, the poses lie on their sides;"
+        " if so, write w last"
+    )
 
 
 def read_route(path: str | os.PathLike[str]) -> NDArray[np.float64]:

@@ -7,6 +7,7 @@ reports.
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict, deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -73,7 +74,15 @@ class PressureEvents:
         if self._refused and now_s - self._published_s >= PRESSURE_S:
             self._event_log.publish(events.Pressure, *self._last, self._refused, *self._memory())
             self._refused, self._published_s = 0, now_s
-        if self._unlogged and now_s - self._logged_s >= LOG_S:
+        if now_s - self._logged_s >= LOG_S:
+            self._log(now_s)
+
+    def close(self) -> None:
+        """Log the refusals not yet reported: there will be no later line."""
+        self._log(self._logged_s)
+
+    def _log(self, now_s: float) -> None:
+        if self._unlogged:
             cell, layer, code = self._last
             budget, used, pinned, _ = self._memory()
             log.warning(
@@ -256,6 +265,12 @@ class CellEvents:
         self._pressure.step(now_s)
         self.minutes.step(now_s)
         self._misses.turn(now_s)
+
+    def close(self) -> None:
+        """Log what the lines of this minute would have counted."""
+        self.flush()
+        self._pressure.close()
+        self.minutes.step(math.inf)
 
     # --- what happens -------------------------------------------------------------------------------
 

@@ -310,7 +310,8 @@ class LiveRelay:
         ShmmapError
             ``alone`` is true, and settings or another daemon prevent every map from being served.
         """
-        end_s = time.monotonic() + seconds
+        begin_s = time.monotonic()
+        end_s = begin_s + seconds
         while not self._serving and (left_s := end_s - time.monotonic()) > 0:
             if self._channel is None:
                 if self._failures > STARTS:
@@ -322,7 +323,8 @@ class LiveRelay:
         if alone and self._refused is not None:
             raise self._refused
         if not self._serving:
-            log.warning("live maps are not ready yet", maps=len(self._begin.maps), after_s=seconds)
+            waited_s = round(time.monotonic() - begin_s, 3)
+            log.warning("live maps are not ready yet", maps=len(self._begin.maps), after_s=waited_s)
             self._show_problem("the process that keeps live maps is being started")
 
     def _show_problem(self, problem: str) -> None:

@@ -284,7 +284,7 @@ class Loads:
         self._queue.discard(load)
         if self.by_key.get(load.key) is load:
             del self.by_key[load.key]
-            self.failures.pop(load.key, None)
+            self.forget_failure(load.key)
             if failure is not None:
                 self._remember(load.key, failure)
 
@@ -300,15 +300,18 @@ class Loads:
     def _remember(self, key: Key, failure: Failure) -> None:
         self.failures[key] = failure
         keys = self._keys_failed.setdefault(failure.code, OrderedDict())
-        keys.pop(key, None)
         keys[key] = None
         if len(keys) > MAX_FAILURES:
-            oldest, _ = keys.popitem(last=False)
-            self._forget_failure(oldest, failure.code)
+            self.forget_failure(next(iter(keys)))
+
+    @property
+    def unloadable(self) -> int:
+        """Number of keys that could not be loaded when last tried, though there was memory and a source."""
+        return len(self._keys_failed.get("load_failed", ()))
 
     def cancel(self, key: Key) -> None:
         """Drop a queued load and a remembered failure of a key (its cell left the map)."""
-        self.failures.pop(key, None)
+        self.forget_failure(key)
         load = self.by_key.get(key)
         if load is not None and not load.running:
             self._queue.discard(load)
@@ -317,16 +320,16 @@ class Loads:
     def forget_refusals(self) -> None:
         """Forget failures for lack of memory: there may be room now."""
         for code in SPACE_CODES:
-            for key in self._keys_failed.pop(code, ()):
-                self._forget_failure(key, code)
+            for key in [*self._keys_failed.get(code, ())]:
+                self.forget_failure(key)
 
     def forget_failures(self) -> None:
         """Forget all other failures: their common cause has passed."""
-        for code in [code for code in self._keys_failed if code not in SPACE_CODES]:
-            for key in self._keys_failed.pop(code):
-                self._forget_failure(key, code)
+        for key in [key for key, failure in self.failures.items() if failure.code not in SPACE_CODES]:
+            self.forget_failure(key)
 
-    def _forget_failure(self, key: Key, code: str) -> None:
-        failure = self.failures.get(key)
-        if failure is not None and failure.code == code:
-            del self.failures[key]
+    def forget_failure(self, key: Key) -> None:
+        """Forget why the last load of a key failed, if it did."""
+        failure = self.failures.pop(key, None)
+        if failure is not None:
+            self._keys_failed[failure.code].pop(key, None)

@@ -237,9 +237,12 @@ class Scheduler:
     def _drop_some(self) -> None:
         for _ in range(min(LOOKS_PER_PUMP, len(self._to_recheck))):
             key = self._to_recheck.popleft()
-            if self._cache.index_of(key.cell_id) is None:
+            index, failure = self._cache.index_of(key.cell_id), self.loads.failures.get(key)
+            if index is None:
                 self.loads.cancel(key)
                 self._observer.load_finished(key)
+            elif failure is not None and failure.stamp not in (None, self._cache.catalogue.stamp(index)):
+                self.loads.forget_failure(key)  # another state of the source
 
     # --- handing out jobs -----------------------------------------------------------------------
 

@@ -238,6 +238,7 @@ class Sampler:
         set_value("workers", len(self.scheduler.pool))
         set_value("loaders_compiling", self.scheduler.pool.compiling)
         set_value("load_queue", len(self.scheduler.loads))
+        set_value("unloadable", self.scheduler.loads.unloadable)
         set_value("events_published", self.event_log.last)
 
     def _look_around(self, now_s: float) -> None:

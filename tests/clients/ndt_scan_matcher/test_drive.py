@@ -21,7 +21,7 @@ from shmmap_clients.command_line import complain
 from shmmap_clients.ndt_scan_matcher import TrustLimits, matrix_from_pose
 from shmmap_clients.ndt_scan_matcher.backends.backend import UploadStatistics
 from shmmap_clients.ndt_scan_matcher.cli.follow_report import FollowReport, print_summary
-from shmmap_clients.ndt_scan_matcher.drive.drive_plot import DrivePlot
+from shmmap_clients.ndt_scan_matcher.drive.drive_plot import DrivePlot, value_label
 from shmmap_clients.ndt_scan_matcher.drive.drive_summary import (
     DriveStatistics,
     RunningErrors,
@@ -299,3 +299,24 @@ def test_what_scans_are_called_is_not_obeyed_by_a_terminal(capsys: pytest.Captur
         "shmmap-ndt: lost at scan \\x1b[2Jscan\\n: no map",
         "hint: --relocalize searches for it",
     ]
+
+
+def test_labels_of_values_fit_into_the_margin() -> None:
+    values = (
+        9.87654321e-15,
+        0.00099999,
+        0.0046789,
+        0.1,
+        1.0,
+        99.95,
+        999.4,
+        999.9,
+        1620.4,
+        999_999.4,
+        1.6e6,
+        3e9,
+    )
+    labels = [value_label(value) for value in values]
+    assert [label for label in labels if len(label) > 7] == []
+    np.testing.assert_allclose([float(label.replace(",", "")) for label in labels], values, rtol=0.5)
+    assert labels[2:4] + labels[8:10] == ["0.00468", "0.1", "1,620", "999,999"]

@@ -77,6 +77,10 @@ def test_times_in_names_are_the_times_of_poses() -> None:
     name = "n015-2018-07-24-11-22-45+0800__LIDAR_TOP__{}.pcd"
     names = " ".join(name.format(1700000000000000 + 300_000 * n) for n in range(3))
     assert paired(names, clock, ".bin") == ([0, 3, 6], "time")
+    # scans and poses 20 ms apart, also where the poses of two sensors follow each other closely
+    assert paired("1700000000.12 1700000000.82", clock) == ([1, 8], "time")
+    two = drive(*(1.7e9 + 0.1 * n + offset for n in range(5) for offset in (0.0, 0.002)))
+    assert paired("1700000000.122 1700000000.322", two) == ([3, 7], "time")
     # poses in another order than scans, as many as these: the place would be wrong
     assert paired("0.1 0.2 0.3", drive(0.3, 0.1, 0.2)) == ([1, 2, 0], "time")
     assert paired("0.104 0.197 0.302", drive(0.1, 0.2, 0.3)) == ([0, 1, 2], "time")

@@ -17,6 +17,7 @@ from shmmap_clients.scans.scan_file import read_scan
 from shmmap_clients.scans.scan_sequence import Scan, ScanSequence
 from shmmap_clients.scans.scan_stream import ScanPublisher, ScanSubscriber, decode_scan, encode_scan
 from shmmap_clients.scans.trajectory import (
+    Trajectory,
     matrix_of,
     quaternion_of,
     read_route,
@@ -50,6 +51,62 @@ def test_a_trajectory_is_read_and_written(tmp_path: Path) -> None:
     read = read_trajectory(path)
     assert read.stamps_s.tolist() == [0.1, 0.2]
     assert np.allclose(read.T_map_sensor[1], T, atol=1e-8)
+
+
+def poses_at(path: Path, stamps: list[str], quaternion: str = "0 0 0 1") -> Trajectory:
+    path.write_text("".join(f"{stamp} {n} 0 0 {quaternion}\n" for n, stamp in enumerate(stamps)))
+    return read_trajectory(path)
+
+
+@pytest.mark.parametrize("begin_s", [0, 1, 86_400, 259_200, 1_700_000_000])  # a drive, uptimes, a clock
+@pytest.mark.parametrize("period_ms", [10, 100, 1000])
+@pytest.mark.parametrize(
+    ("unit", "per_s"),
+    [("seconds", 1), ("milliseconds", 10**3), ("microseconds", 10**6), ("nanoseconds", 10**9)],
+)
+def test_the_unit_of_times_is_recognised(
+    tmp_path: Path, begin_s: int, period_ms: int, unit: str, per_s: int
+) -> None:
+    truth = [begin_s + n * period_ms / 1000 for n in range(8)]
+    whole = [begin_s * per_s + n * period_ms * per_s // 1000 for n in range(8)]
+    read = poses_at(
+        tmp_path / "p.txt", [f"{s:.3f}" for s in truth] if per_s == 1 else [str(w) for w in whole]
+    )
+    if unit == "milliseconds" and begin_s < 86_400:  # or numbers of frames: in doubt
+        assert f"{period_ms} apart and read as seconds" in read.notes[0]
+        return
+    np.testing.assert_allclose(read.stamps_s, truth, rtol=0, atol=1e-6)
+    said = () if per_s == 1 else (f"times in {tmp_path / 'p.txt'} are read as {unit}",)
+    assert tuple(note.partition(",")[0] for note in read.notes) == said
+
+
+def test_numbers_of_frames_and_single_times_stay(tmp_path: Path) -> None:
+    assert poses_at(tmp_path / "p.txt", ["0", "1", "2"]).stamps_s.tolist() == [0.0, 1.0, 2.0]
+    assert poses_at(tmp_path / "p.txt", ["7"]).notes == ()
+    assert poses_at(tmp_path / "p.txt", ["5", "5", "5"]).notes == ()
+    every_eighth = poses_at(tmp_path / "p.txt", ["0", "8", "16"])
+    assert every_eighth.stamps_s.tolist() == [0.0, 8.0, 16.0]
+    assert "numbers of frames" in every_eighth.notes[0]
+    assert poses_at(tmp_path / "p.txt", ["1700000000123456789"]).stamps_s == pytest.approx(1700000000.123457)
+
+
+def test_quaternions_with_w_first_are_named_and_not_turned(tmp_path: Path) -> None:
+    yaws = np.linspace(-0.4, 2.0, 20)
+    lines = [f"{n / 10} {n} 0 0 {np.cos(yaw / 2)} 0.01 0 {np.sin(yaw / 2)}" for n, yaw in enumerate(yaws)]
+    (tmp_path / "p.txt").write_text("\n".join(lines))
+    read = read_trajectory(tmp_path / "p.txt")
+    assert len(read.notes) == 1
+    assert "look like w first" in read.notes[0]
+    assert np.allclose(
+        read.T_map_sensor[3, :3, :3], matrix_of((0, 0, 0), map(float, lines[3].split()[4:]))[:3, :3]
+    )
+    # the same with w last, a camera's frame, and a scanner that hangs upside down
+    upside_down = [(np.cos(yaw / 2), np.sin(yaw / 2), 0.0, 0.0) for yaw in yaws]
+    camera = [(0.0, np.sin(yaw / 2), 0.0, np.cos(yaw / 2)) for yaw in yaws]
+    for turns in ([(0.0, 0.01, np.sin(yaw / 2), np.cos(yaw / 2)) for yaw in yaws], camera, upside_down):
+        text = "\n".join(f"{n / 10} {n} 0 0 {' '.join(map(str, q))}" for n, q in enumerate(turns))
+        (tmp_path / "p.txt").write_text(text)
+        assert read_trajectory(tmp_path / "p.txt").notes == ()
 
 
 @pytest.mark.parametrize("line", ["1 2 3", "a b c d e f g h", "0 0 0 0 0 0 0 0", "0 nan 0 0 0 0 0 1"])

@@ -13,7 +13,7 @@ import pytest
 import shmmap
 from shmmap import ShmmapWarning
 from tests.process.conftest import DaemonFactory
-from tests.support.command_line import Verbs, doctor, verb
+from tests.support.command_line import Shmmap, Verbs, doctor, verb
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap, random_points
 
@@ -41,8 +41,10 @@ def test_moved_cells_are_named_everywhere(
     move(divided_map, MOVED, 1000.0)
     one = daemon(divided_map.root)
     with shmmap.connect(one.endpoint) as client:
-        with pytest.warns(ShmmapWarning, match=rf"{MOVED}: 300 of the cell's points lie outside its box"):
+        outside = f"{MOVED}: 300 of the cell's points lie outside its box"
+        with pytest.warns(ShmmapWarning, match=outside) as caught:
             cells = client.around(0, 0, 30, wait=60).cells
+        assert [warning.filename for warning in caught] == [__file__], "the line of the program's own call"
         assert len(cells) > 1
         assert count(client) == 1
         with warnings.catch_warnings():
@@ -50,6 +52,11 @@ def test_moved_cells_are_named_everywhere(
             del cells
             client.around(0, 0, 30)
             client.around(0, 0, 30, layers=["voxel(leaf=2.0)"], wait=60)
+        exported = Shmmap(one, tmp_path).run("export", "--circle", "0,0,30", "-o", str(tmp_path / "all.pcd"))
+        first, *more = exported.stderr.splitlines()
+        assert first.startswith("shmmap: ")
+        assert outside in first
+        assert not any("Warning" in line or ".py" in line for line in [first, *more]), "the text alone"
         assert one.log.count("points outside the cell's box") == 1
         assert divided_map.id(MOVED) in one.log
         assert "1 cell with points outside the cell's box" in verb(one, "status")[1]

@@ -81,6 +81,42 @@ def test_the_ground_is_that_of_the_pose(
     assert found.ground_z == pytest.approx(z - 1.8, abs=0.1)
 
 
+def test_of_levels_above_each_other_the_rough_height_chooses(
+    town: TownDrive, daemon: DaemonFactory, tmp_path: Path
+) -> None:
+    x, y, z, _, _, yaw = town.poses[2]
+    storeys = [town.points + np.array([0.0, 0.0, height], np.float32) for height in (0.0, 8.0)]
+    shmmap.write_pcd(tmp_path / "map.pcd", {"xyz": np.concatenate(storeys)})
+    one = daemon(tmp_path / "map.pcd")
+    file = town.scans / "scan_0002.npz"
+    scan = read_scan(file)
+    with PoseInitializer(one.endpoint, InitializerRules(map_radius=60.0, height=1.8)) as initializer:
+        for rough_z, found_z in ((z, z), (z + 8.0, z + 8.0), (z - 2.0, z), (z + 10.5, z + 8.0)):
+            found = initializer.initialize(scan, RoughPose(x + 1.0, y - 1.0, rough_z, yaw=yaw + 0.08))
+            np.testing.assert_allclose(found.T_map_base[:3, 3], [x, y, found_z], atol=0.1)
+            assert found.reliable
+            np.testing.assert_allclose(found.grounds, [z - 1.8, z + 6.2], atol=0.1)
+        for unclear in (None, z + 4.0, z + 500.0):
+            found = initializer.initialize(scan, RoughPose(x + 1.0, y - 1.0, unclear, yaw=yaw + 0.08))
+            assert not found.reliable
+            assert found.failed_limits == ("level",)
+            low, high = found.grounds
+            assert found.level_doubt == f"two grounds, {low:.1f} and {high:.1f} m: the scan fits both"
+            heights = {
+                round(float(T[2, 3] - z)) for T in (found, *found.alternatives) for T in [T.T_map_base]
+            }
+            assert heights == {0, 8}
+    program = ["--endpoint", one.endpoint, "--scan", str(file), "--height", "1.8", "--map-radius", "60"]
+    done = pose_init(*program, "--pose", f"{x + 1},{y - 1},{yaw}", "--pose-format", "xyyaw")
+    assert done.returncode == 1, done.stderr
+    assert f"NOT reliable (two grounds, {low:.1f} and {high:.1f} m: the scan fits both)" in done.stdout
+    done = pose_init(*program, "--pose", f"{x + 1},{y - 1},{z + 8.0},0,0,{yaw}", "--json")
+    document = json.loads(done.stdout)
+    assert (done.returncode, document["failed_limits"], document["level_doubt"]) == (0, [], None)
+    assert document["T_map_base"][2][3] == pytest.approx(z + 8.0, abs=0.1)
+    assert document["grounds"] == pytest.approx([low, high])
+
+
 @pytest.mark.parametrize(
     ("part", "failed"),
     [

@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from shmmap.client.cell import Cell
 from shmmap.errors import MapDataError, ShmmapError
 from shmmap.formats.cloud import describe, read_cloud, read_pcd
 from shmmap.formats.pcd.writer import write_pcd
 from shmmap.formats.source_file import CAUSES
-from shmmap.layers.selections import SYSTEM_PACKAGES, load_open3d
+from shmmap.open3d_loading import SYSTEM_PACKAGES, load_open3d
 from tests.support.cloud_bytes import Field, column, pcd, write_las
 from tests.support.daemon_process import ROOT
 
@@ -107,20 +108,27 @@ def test_what_is_no_file_is_refused_for_that(tmp_path: Path, name: str) -> None:
     assert caught.value.cause == "unreadable"
 
 
-def test_missing_system_libraries_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("kind", [ImportError, OSError])  # of a module, and of a library that it opens
+def test_missing_system_libraries_are_named(
+    monkeypatch: pytest.MonkeyPatch, kind: type[ImportError | OSError]
+) -> None:
     original = builtins.__import__
 
     def without(name: str, *args: Any, **kwargs: Any) -> Any:
         if name == "open3d":
-            raise ImportError("libEGL.so.1: cannot open shared object file")
+            raise kind("libusb-1.0.so.0: cannot open shared object file")
         return original(name, *args, **kwargs)
 
     monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(ShmmapError) as caught:
-        load_open3d("the layer normals")
-    assert not isinstance(caught.value, MapDataError)
-    for package in SYSTEM_PACKAGES:
-        assert package in str(caught.value)
+    unused: Any = None
+    for load in (lambda: load_open3d("the layer normals"), lambda: Cell.to_open3d(unused)):
+        with pytest.raises(ShmmapError) as caught:
+            load()
+        assert not isinstance(caught.value, MapDataError)
+        assert {"libegl1", "libgl1", "libx11-6", "libusb-1.0-0", "libgomp1"} <= set(SYSTEM_PACKAGES)
+        for package in SYSTEM_PACKAGES:
+            assert package in caught.value.hint
+        assert "libusb-1.0.so.0" in caught.value.message
     assert ("libgfortran5" in SYSTEM_PACKAGES) == (platform.machine() != "x86_64")
 
 

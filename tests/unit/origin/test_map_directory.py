@@ -7,8 +7,10 @@ import contextlib
 import os
 import resource
 import struct
+import unicodedata
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -331,3 +333,53 @@ def test_without_descriptors_a_map_is_whole_or_the_limit_is_named(tmp_path: Path
     assert versions == [whole] * (12 - len(refused))
     assert len(refused) > 2
     assert all("LimitNOFILE=" in hint for hint in refused)
+
+
+def test_a_map_both_whole_and_in_cells_names_the_cells(tmp_path: Path) -> None:
+    for name, beside in (("pointcloud_map", True), ("cells of 20 m", True), ("pointcloud_map", False)):
+        root = tmp_path / f"{name} {beside}"
+        put_cells(root / name)
+        lists = root if beside else root / name
+        (lists / "pointcloud_map_metadata.yaml").write_text(metadata_text())
+        write_pcd(root / "pointcloud_map.pcd", {axis: np.arange(3, dtype=np.float32) for axis in "xyz"})
+        if beside:  # the list is not that of the one file
+            with pytest.raises(MapDataError, match="have no file in") as refused:
+                open_map(root).load()
+            assert refused.value.hint == f"the map in cells seems to be {root / name}: name that"
+        else:
+            assert len(open_map(root).load()) == 1
+        check(root / name, root / name)
+        os.truncate(root / "pointcloud_map.pcd", 300 << 20)  # sparse
+        with pytest.raises(MapDataError) as refused:
+            open_map(root / "pointcloud_map.pcd").load()
+        assert str(root / name) in refused.value.hint
+
+
+@pytest.mark.parametrize(("listed", "stored"), [("NFC", "NFD"), ("NFD", "NFC"), ("NFC", "NFC")])
+@pytest.mark.parametrize(
+    "names", [("Straße_ö.pcd", "Zürich.pcd"), ("Zürich.pcd", "plain.pcd"), ("가.pcd", "ệ.pcd")]
+)
+def test_accents_are_equal_however_they_are_written(
+    tmp_path: Path, names: tuple[str, str], listed: Literal["NFC", "NFD"], stored: Literal["NFC", "NFD"]
+) -> None:
+    written = [unicodedata.normalize(stored, name) for name in names]
+    put_cells(tmp_path, written)
+    lines = [f"{unicodedata.normalize(listed, name)}: [{20 * n}, 0]" for n, name in enumerate(names)]
+    text = "x_resolution: 20\ny_resolution: 20\n" + "\n".join(lines)
+    (tmp_path / "pointcloud_map_metadata.yaml").write_text(text, encoding="utf-8")
+    catalogue = open_map(tmp_path).load()
+    assert catalogue.problems == ()
+    boxes = {catalogue.id(n): catalogue.box(n)[0] for n in range(len(catalogue))}
+    assert boxes == {str(tmp_path / name): 20 * n for n, name in enumerate(written)}
+
+
+@pytest.mark.parametrize("place", [".", ".."])
+def test_a_list_under_another_name_is_named(tmp_path: Path, place: str) -> None:
+    cells = tmp_path / "cells"
+    put_cells(cells)
+    lists = cells / place / "metadata.yaml"
+    lists.write_text(metadata_text())
+    with pytest.raises(MapDataError, match=r"3 PCD files but no pointcloud_map_metadata\.yaml") as refused:
+        open_map(cells).load()
+    assert f"--metadata FILE (is it {os.path.normpath(lists)}?)" in refused.value.hint
+    assert len(open_map(cells, metadata=lists).load()) == 3

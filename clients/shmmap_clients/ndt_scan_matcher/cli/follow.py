@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from shmmap_clients.command_line import (
@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from shmmap_clients.ndt_scan_matcher.map.map_updater import MapUpdater
     from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher
     from shmmap_clients.pose_initializer import Relocalizer
+    from shmmap_clients.scan_drive import ScanDrive
     from shmmap_clients.scans.scan_sequence import Scan
 
 __all__ = ["EPILOG", "add_options", "add_parser", "run"]
@@ -135,7 +136,7 @@ def run(args: argparse.Namespace) -> int:
         if first is None:
             return drive.no_scans()
         T_first, known = _start(args, first)
-        prediction = _prediction(args, T_first, subscriber, drive.scans)
+        prediction = _prediction(args, T_first, subscriber, drive)
         matcher = stack.enter_context(matcher_from(args))
         client = stack.enter_context(connect(args, "shmmap-ndt"))
         maps = stack.enter_context(_map_updater(args, client, matcher, route))
@@ -227,7 +228,7 @@ def _prediction(
     args: argparse.Namespace,
     T_first: NDArray[np.float64],
     subscriber: OdometrySubscriber | None,
-    source: Iterable[Scan],
+    drive: ScanDrive,
 ) -> MotionPrediction:
     """Return the motion prediction; its first velocity comes from the truth or the route's times."""
     from shmmap_clients.ndt_scan_matcher.drive import motion_prediction
@@ -238,7 +239,7 @@ def _prediction(
     if subscriber is not None:
         return Odometry(T_first, lambda: subscriber.trajectory)
     if args.odometry is None:
-        truth = source.trajectory if isinstance(source, ScanSequence) else None
+        truth = drive.scans.trajectory if isinstance(drive.scans, ScanSequence) else None
         if truth is not None:
             return ConstantVelocity(T_first, motion_prediction.first_twist(truth))
         if args.route is not None and not args.route.lower().endswith(".csv"):
@@ -246,6 +247,8 @@ def _prediction(
             return ConstantVelocity(T_first, motion_prediction.twist_on_route(route, T_first))
         return ConstantVelocity(T_first)
     read = read_trajectory(args.odometry)
+    for note in read.notes if args.odometry != args.truth else ():
+        drive.reader.say(note)
     return Odometry(T_first, lambda: read)
 
 
@@ -273,7 +276,8 @@ def _relocalizer(args: argparse.Namespace, stack: contextlib.ExitStack) -> Reloc
         )
         return stack.enter_context(made)
 
-    return Relocalizer(initializer, sigma_m=args.sigma, sigma_yaw=args.sigma_yaw)
+    knows_z = args.rough is None or args.pose_format != "xyyaw"
+    return Relocalizer(initializer, sigma_m=args.sigma, sigma_yaw=args.sigma_yaw, knows_z=knows_z)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -12,7 +12,7 @@ from shmmap_clients.ndt_scan_matcher.drive.drive_summary import pose_errors
 from shmmap_clients.ndt_scan_matcher.drive.follower import Frame
 from shmmap_clients.spread import Decimated
 
-__all__ = ["DrivePlot"]
+__all__ = ["DrivePlot", "value_label"]
 
 _WIDTH: Final = 900.0
 _MARGIN: Final = 60.0
@@ -93,12 +93,19 @@ class DrivePlot:
         return page.svg(top - 30)
 
 
+def value_label(value: float) -> str:
+    """Return a positive value in at most seven characters, which fit into the margin."""
+    if 1e-3 <= value < 1000:
+        return f"{value:.3g}"
+    return f"{value:,.0f}" if 1000 <= value < 999_999.5 else f"{value:.0e}"
+
+
 def _chart(page: Page, top: float, title: str, lines: Mapping[str, Sequence[float]]) -> None:
     """Draw values over the scan number, one line for each colour."""
     every = [value for values in lines.values() for value in values if math.isfinite(value)]
     most = max(every, default=0.0) or 1.0
     last = max(1, *(len(values) - 1 for values in lines.values()))
     axes = Axes(page, (0.0, 0.0, last, most), page.margin, top, page.right - page.margin, _CHART_HEIGHT)
-    axes.frame(title, y_labels=[(0.0, "0"), (most, f"{most:.3g}")])
+    axes.frame(title, y_labels=[(0.0, "0"), (most, value_label(most))])
     for colour, values in lines.items():
         axes.line(enumerate(values), stroke=colour)

@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import re
 from typing import TYPE_CHECKING
 
 from shmmap.cli.areas import add_area_or_ids, area_from, no_cell_there, print_near_cells
 from shmmap.cli.compiling_lines import saying_what_the_daemon_compiles
-from shmmap.cli.daemon_address import connect
+from shmmap.cli.daemon_address import connect, snapshot
 from shmmap.cli.options import (
     Subparsers,
     add_daemon_options,
@@ -30,7 +31,7 @@ from shmmap.cli.screens.output import (
     print_table,
     rows_text,
 )
-from shmmap.errors import BadRequest
+from shmmap.errors import BadRequest, ShmmapError
 from shmmap.lacking import (
     empty_layers,
     failure_lines,
@@ -128,9 +129,31 @@ def run(args: argparse.Namespace) -> int:
         if not found.complete:
             if not found.covered:
                 complain("shmmap", *not_covered(found))
+            if found.pending and args.wait is not None:
+                complain("shmmap", *_still_pending(args, found))
             print_near_cells(near_cells_hint(client, unknown_ids(found.failed)))
             return 1
         return _judge_empty(args, client, area, found)
+
+
+def _still_pending(args: argparse.Namespace, found: CellSet) -> tuple[str, str]:
+    """Return why layers are pending after the wait, as far as the statistics show it, and what to do."""
+    layers = counted(len(found.pending), "layer")
+    what = (
+        f"{layers} of cells {'is' if len(found.pending) == 1 else 'are'} still pending after {args.wait:g} s"
+    )
+    with contextlib.suppress(ShmmapError):
+        counts = snapshot(args)[0].counters
+        queued, loaders = counts.get("load_queue", 0), counted(counts.get("workers", 0), "loader")
+        if counts.get("origin_out", 0):
+            return f"{what}: the map's files are out of reach", "shmmap doctor"
+        if queued:
+            what += f": {counted(queued, 'load')} waiting for {loaders}"
+        elif counts.get("loaders_compiling", 0):
+            what += ": the daemon compiles kernels, once for this version"
+        else:
+            what += f": {loaders} at work"
+    return what, "ask again, or wait longer: --wait SECONDS; `shmmap top` shows loads"
 
 
 def _judge_empty(args: argparse.Namespace, client: Client, area: Area | None, found: CellSet) -> int:

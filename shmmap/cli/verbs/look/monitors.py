@@ -13,19 +13,21 @@ from shmmap.cli.daemon_address import endpoint, has_lost_socket, locate, snapsho
 from shmmap.cli.options import Subparsers, add_statistics_options, add_verb
 from shmmap.cli.screens.output import counted, format_duration, print_hanging, print_json, print_line
 from shmmap.doctor.verdicts import trust_problems
-from shmmap.errors import DaemonUnreachable, NoSocket, ProtocolMismatch
+from shmmap.errors import DaemonUnreachable, NoSocket, ProtocolMismatch, ShmmapError
 
 if TYPE_CHECKING:
     from shmmap.doctor.verdicts import Finding
+    from shmmap.statistics.identity import DaemonIdentity
     from shmmap.statistics.reader import Snapshot
 
 __all__ = ["add_doctor", "add_health", "add_metrics", "run_doctor", "run_health", "run_metrics"]
 
 _HEALTH_EXIT = """\
 Exit code: 0 healthy, 1 starting, unreachable, paused or hung, 69 dead or never started; with --strict
-also 1 while clients lack something: cells were refused in the last minute, the map's files are out of
-reach, the map could not be read again or has problems, its signature has expired, the version that its origin
-offers is refused, or a live map has a problem, a damaged file or a missing chunk."""
+also 1, and `unhealthy`, while clients lack something: cells were refused in the last minute, cells that were
+asked for cannot be loaded (they are named if the daemon answers), the map's files are out of reach, the map
+could not be read again or has problems, its signature has expired, the version that its origin offers is
+refused, or a live map has a problem, a damaged file or a missing chunk."""
 
 
 _NAMED = 3
@@ -55,6 +57,8 @@ def run_health(args: argparse.Namespace) -> int:
     """Print the health in one word, with reasons; return the exit code."""
     found, identity = snapshot(args)
     troubles = _troubles(found)
+    if found.state == "healthy" and (args.strict or args.json):
+        troubles += _unloadable(found, identity)
     lost = found.state == "healthy" and has_lost_socket(found)
     state = "unreachable" if lost else found.state
     if args.json:
@@ -65,6 +69,8 @@ def run_health(args: argparse.Namespace) -> int:
     else:
         age = format_duration(found.beat_age_s)
         shown = "paused" if state == "stopped" else state
+        if args.strict and troubles and state == "healthy":
+            shown = "unhealthy"
         print_line(f"{shown}: pid {identity.pid}, last heartbeat {age} ago{_defects(found)}")
         if lost:
             print_line(
@@ -100,6 +106,20 @@ def _troubles(found: Snapshot) -> list[str]:
     if counts.get("last_reload_failed", 0) and not counts.get("published_refusal", 0):
         troubles.append("the map could not be read again: its old state is served")
     return troubles
+
+
+def _unloadable(found: Snapshot, identity: DaemonIdentity) -> list[str]:
+    """Name the cells that could not be loaded when clients asked for them."""
+    count = found.counters.get("unloadable", 0)
+    if not count:
+        return []
+    from shmmap.doctor.cells import causes, failing_cells
+
+    with contextlib.suppress(ShmmapError):
+        if failing := failing_cells(identity.endpoint, identity, "shmmap health"):
+            cells = counted(len({cell for cell, _ in failing}), "cell")
+            return [f"{cells} cannot be loaded: {causes(failing)}"]
+    return [f"{counted(count, 'layer')} of cells cannot be loaded: the daemon's log names them"]
 
 
 def _defects(found: Snapshot) -> str:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from shmmap.cli.daemon_address import endpoint
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb, seconds
-from shmmap.cli.program import complain
+from shmmap.cli.program import check_terminal, complain
 from shmmap.cli.screens.output import (
     counted,
     format_bytes,
@@ -83,16 +83,18 @@ def run(args: argparse.Namespace) -> int:
         while (happening := stream.next(0.0)) is not None:
             show(happening)
         sys.stdout.flush()
+        on_terminal, said = sys.stdout.isatty(), False
         while follow:
+            check_terminal(was_there=on_terminal)
             happening = stream.next(SILENT_S)
             if happening is not None:
+                said = False
                 show(happening)
                 sys.stdout.flush()
-            elif time.monotonic() - stream.last_message_s > SILENT_S:
+            elif not said and time.monotonic() - stream.last_message_s > SILENT_S:
                 # the daemon sends a heartbeat every second: its silence is reported once
                 complain("shmmap", "no heartbeat from the daemon", "shmmap health")
-                show(stream.next(None))
-                sys.stdout.flush()
+                said = True
     return 0
 
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from shmmap.cli.daemon_address import locate, snapshot
 from shmmap.cli.options import Subparsers, add_statistics_options, add_verb, seconds
+from shmmap.cli.program import check_terminal
 from shmmap.cli.screens.output import print_json, print_line, printable
 from shmmap.errors import DaemonUnreachable
 
@@ -122,6 +123,7 @@ def _live(reader: StatisticsReader, interval_s: float) -> int:
             Live(console=console, screen=True, auto_refresh=False, transient=True) as live,
         ):
             while True:
+                check_terminal(was_there=True)
                 found = reader.snapshot(cells=False)
                 live.update(_render(found, earlier, console), refresh=True)
                 time.sleep(interval_s)

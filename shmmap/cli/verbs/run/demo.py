@@ -111,6 +111,8 @@ def run(args: argparse.Namespace) -> int:
         raise BadRequest("--live drives in a town of its own", hint="leave out --keep-map and --density")
     picture = _picture_path(args.svg, "shmmap-demo-live.svg" if args.live else "shmmap-demo.svg")
     started_s = time.monotonic()
+    if not args.json:
+        _note_of_compiling()
     with signals_interrupt(), progress_for(quiet=args.json) as progress:
         report = (_drive_live if args.live else _drive)(args, progress)
     duration_s = time.monotonic() - started_s
@@ -123,6 +125,16 @@ def run(args: argparse.Namespace) -> int:
         if args.keep_map:
             print_line(f"Serve the town yourself: shmmap serve {args.keep_map}")
     return 0 if report.passed else 1
+
+
+def _note_of_compiling() -> None:
+    """Say that kernels compile beside the demonstration, if they are not kept yet."""
+    import importlib.util
+
+    from shmmap.kernel_cache import are_compiled
+
+    if importlib.util.find_spec("numba") is not None and not are_compiled():
+        print_line("compiling kernels meanwhile, once for this version", flush=True)
 
 
 def _drive(args: argparse.Namespace, progress: Progress) -> DemoReport:

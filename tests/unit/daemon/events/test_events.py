@@ -162,6 +162,13 @@ def test_refusals_are_a_line_a_minute_with_holder_and_setting(
     first, second = caplog.messages
     assert first.startswith(f"cells refused for lack of memory count=1 code={code} last=0.pcd layer=points")
     assert second.startswith(f"cells refused for lack of memory count=600 code={code} last=600.pcd")
+    pressure.close()
+    assert len(caplog.messages) == 3, "what the next line would have counted is logged at the end"
+    assert caplog.messages[2].startswith(
+        f"cells refused for lack of memory count=99 code={code} last=699.pcd"
+    )
+    pressure.close()
+    assert len(caplog.messages) == 3
     for line in (first, second):
         assert 'most_is_held_by="planner (pid 7): 3.0 MiB"' in line
         assert setting in line
