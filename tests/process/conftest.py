@@ -94,7 +94,7 @@ def short_path() -> Iterator[Path]:
 
 
 @pytest.fixture
-def daemon(private_tmpfs: Callable[[str], str]) -> Iterator[DaemonFactory]:
+def daemon(private_tmpfs: Callable[[str], str], layer_kernels: None) -> Iterator[DaemonFactory]:
     """Start daemons, ``daemon(map_path, *flags, environment=..., shm_dir=..., start=True)``.
 
     What they may leave behind: `shmmap.testing.daemon_process.isolated_daemons`.
@@ -109,7 +109,7 @@ def standing_map(tmp_path_factory: pytest.TempPathFactory) -> DividedMap:
 
 
 @pytest.fixture(scope="module")
-def standing(standing_map: DividedMap) -> Iterator[DaemonProcess]:
+def standing(standing_map: DividedMap, layer_kernels: None) -> Iterator[DaemonProcess]:
     """One daemon of that map for the tests of a module that only read; judged at the module's end."""
     with contextmanager(judged_daemons)(DaemonProcess) as make:
         yield make(standing_map.root)

@@ -113,6 +113,7 @@ def test_what_is_printed_is_as_the_schemas_say(shmmap: Shmmap) -> None:
         assert [json.loads(json.dumps(one)) for one in outcomes] == [document], words
 
 
+@pytest.mark.slow
 def test_verbs_that_look_while_the_daemon_is_stopped(shmmap: Shmmap, divided_map: DividedMap) -> None:
     shmmap("query", "--circle", "0,0,5")
     pid = shmmap.daemon.pid
@@ -240,6 +241,7 @@ def test_export_npz_and_single_cells(reading: Shmmap, standing_map: DividedMap) 
     assert all(copy[name].tobytes() == original[name].tobytes() for name in original)
 
 
+@pytest.mark.slow
 def test_export_never_overwrites_unasked_and_writes_all_or_nothing(
     shmmap: Shmmap, divided_map: DividedMap
 ) -> None:
@@ -262,6 +264,7 @@ def test_export_never_overwrites_unasked_and_writes_all_or_nothing(
     assert len(read_pcd(target)["x"]) == 500
 
 
+@pytest.mark.slow
 def test_who_misspells_a_cell_is_exported_which_there_are(reading: Shmmap) -> None:
     for words in (["show"], ["query", "--id"], ["pin"], ["unpin"], ["evict"]):
         done = reading.run(*words, "/elsewhere/20_0.pdc")

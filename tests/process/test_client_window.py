@@ -361,6 +361,7 @@ def test_a_blocking_window_raises_and_keeps_what_it_has(
         assert_window(window, divided_map, 50, 0, 30)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_reload_finishes_in_a_budget_of_the_window_and_one_cell(
     daemon: Factory, tmp_path: Path, kind: str, make: MakeWindow
@@ -564,6 +565,7 @@ os._exit(0)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("strace") is None, reason="strace is not installed")
 def test_a_swap_makes_no_system_call_that_maps_on_the_control_thread(daemon: Factory, tmp_path: Path) -> None:
     made = make_map(tmp_path / "map", columns=50, rows=16, points=20)

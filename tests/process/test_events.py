@@ -136,6 +136,7 @@ def test_a_beginning_that_makes_no_sense(since: float) -> None:
         EventStream("/nowhere.sock", since=since)
 
 
+@pytest.mark.slow
 def test_a_gap_is_noticed_and_closed(served: DaemonProcess, connect: Connect, listen: Listen) -> None:
     """More happens than any queue holds while the listener does not read: the oldest are `MissedEvents`."""
     client, stream = connect(served), listen(served)
@@ -169,6 +170,7 @@ sys.stdin.read()
 """
 
 
+@pytest.mark.slow
 def test_a_stopped_listener_delays_no_other(served: DaemonProcess, connect: Connect, listen: Listen) -> None:
     client, stream = connect(served), listen(served)
     path = f"{served.runtime_dir}/{served.instance}.events.sock"

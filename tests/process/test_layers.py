@@ -203,6 +203,7 @@ def test_a_kind_of_another_package_with_a_halo(
     assert len(again.cells) == 36
 
 
+@pytest.mark.slow
 def test_normals_have_no_seam(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
     open3d_or_skip()
     client = connect(daemon(divided_map.root))

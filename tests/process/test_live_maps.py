@@ -79,6 +79,7 @@ def test_a_drive_is_mapped_as_the_slow_reference_says(live_daemon: LiveDaemon) -
             assert mapper.add(np.zeros((0, 3)), np.eye(4)) > len(numbers)  # never a number again
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("killed", [1, 2], ids=["starting", "none"])
 def test_a_worker_killed_just_before_the_end_leaves_nothing_behind(
     live_daemon: LiveDaemon, killed: int
@@ -132,6 +133,7 @@ TIMES = {"live.map": 3, "live.synced": 1, "live.flushed": 1}
 """How often a step is taken until the worker is killed in it; the others often."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("label", LIVE_STEPS)
 def test_a_worker_killed_at_any_step_loses_nothing(
     live_daemon: LiveDaemon, tmp_path: Path, label: str
@@ -336,6 +338,7 @@ def shmmap_command(*words: str) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_a_daemon_whose_kernels_are_compiled_is_starting(live_daemon: LiveDaemon, tmp_path: Path) -> None:
     """It beats, and says that it does not listen yet."""
     one = live_daemon(start=False)

@@ -169,6 +169,7 @@ def test_reload_repeatedly_while_clients_ask(
     assert_same_points(asker, final, divided_map)
 
 
+@pytest.mark.slow
 def test_endless_metadata_changes_nothing(client: RawClient, divided_map: DividedMap) -> None:
     old = client.selected(["0_0.pcd"]).cells[0]
     metadata = divided_map.root / "pointcloud_map_metadata.yaml"

@@ -90,6 +90,7 @@ def test_versions_are_signed_and_what_is_the_same_is_not_signed_again(
     assert read_signed(store, keys).version == 3
 
 
+@pytest.mark.slow
 def test_a_map_that_was_not_signed_becomes_signed(shmmap: Verbs, town: DividedMap, tmp_path: Path) -> None:
     shmmap("publish", town.root, tmp_path / "store")
     done = shmmap.json("publish", town.root, tmp_path / "store", "--sign", tmp_path / "keys")
@@ -97,6 +98,7 @@ def test_a_map_that_was_not_signed_becomes_signed(shmmap: Verbs, town: DividedMa
     assert read_signed(tmp_path / "store", tmp_path / "keys").version == 1
 
 
+@pytest.mark.slow
 def test_a_signed_map_is_not_changed_without_its_keys(
     shmmap: Verbs, town: DividedMap, store: Path, keys: Path, tmp_path: Path
 ) -> None:
@@ -133,6 +135,7 @@ def test_a_key_that_others_can_use_is_refused(
     assert read_signed(store, keys).version == 1
 
 
+@pytest.mark.slow
 def test_a_key_that_is_none_or_another_one(shmmap: Verbs, town: DividedMap, store: Path, keys: Path) -> None:
     town.change("0_0.pcd", seed=1)
     whole = (keys / "targets.pem").read_bytes()
@@ -170,6 +173,7 @@ def test_a_refresh_signs_what_runs_out(shmmap: Verbs, store: Path, keys: Path) -
     assert signed.snapshot.signed.expires > in_days(29.9)
 
 
+@pytest.mark.slow
 def test_publishing_the_same_signs_targets_again_before_they_run_out(
     shmmap: Verbs, town: DividedMap, store: Path, keys: Path
 ) -> None:
@@ -180,6 +184,7 @@ def test_publishing_the_same_signs_targets_again_before_they_run_out(
     assert signed.targets.signed.expires > in_days(364)
 
 
+@pytest.mark.slow
 def test_damaged_metadata_is_not_built_upon(shmmap: Verbs, town: DividedMap, store: Path, keys: Path) -> None:
     town.change("0_0.pcd", seed=1)
     for name in ("timestamp.json", "1.snapshot.json", "1.targets.json"):
@@ -196,6 +201,7 @@ def test_damaged_metadata_is_not_built_upon(shmmap: Verbs, town: DividedMap, sto
 # --- killed, and two at a time ------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("label", ["keys", "root", "metadata", "timestamp", "signed"])
 def test_killed_the_first_time_it_goes_on(
     label: str, shmmap: Verbs, town: DividedMap, tmp_path: Path
@@ -210,6 +216,7 @@ def test_killed_the_first_time_it_goes_on(
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("verb", "label"),
     [
@@ -244,6 +251,7 @@ def test_killed_anywhere_one_version_is_signed_and_whole(
     shmmap("fetch", store, tmp_path / "back")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("label", ["sign.metadata", "sign.timestamp", "sign.repaired"])
 def test_a_refresh_that_is_killed(label: str, shmmap: Verbs, store: Path, keys: Path) -> None:
     Signed(store, keys).write("snapshot", expires=in_days(1))
@@ -255,6 +263,7 @@ def test_a_refresh_that_is_killed(label: str, shmmap: Verbs, store: Path, keys: 
     assert read_signed(store, keys).snapshot.signed.expires > in_days(29)
 
 
+@pytest.mark.slow
 def test_entry_and_current_are_repaired(shmmap: Verbs, town: DividedMap, store: Path, keys: Path) -> None:
     for seed, damage in enumerate(("entry", "other entry", "no current", "later")):
         town.change("0_0.pcd", seed=seed)
@@ -284,6 +293,7 @@ def before_its_timestamp(shmmap: Verbs, town: DividedMap, store: Path, keys: Pat
     return slow
 
 
+@pytest.mark.slow
 def test_a_refresh_that_comes_between_costs_nothing(
     shmmap: Verbs, town: DividedMap, store: Path, keys: Path
 ) -> None:
@@ -297,6 +307,7 @@ def test_a_refresh_that_comes_between_costs_nothing(
     assert (signed.version, signed.timestamp.signed.version) == (2, 3)
 
 
+@pytest.mark.slow
 def test_the_slower_of_two_publishers_changes_nothing(
     shmmap: Verbs, town: DividedMap, store: Path, keys: Path
 ) -> None:
@@ -321,6 +332,7 @@ def key_of(keys: Path, name: str) -> bytes:
     return (keys / f"{name}.pem").read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("role", ["root", "targets", "snapshot", "timestamp"])
 def test_a_rotated_key_signs_from_then_on_and_vehicles_follow(
     role: str, shmmap: Verbs, town: DividedMap, store: Path, keys: Path
@@ -359,6 +371,7 @@ def test_a_rotated_key_signs_from_then_on_and_vehicles_follow(
     assert "is not the key that the map's root of trust names for" in errors
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("role", "label"),
     [
@@ -405,6 +418,7 @@ def test_a_rotation_killed_anywhere_leaves_a_valid_map(
     assert taken(2)
 
 
+@pytest.mark.slow
 def test_what_a_rotation_needs(shmmap: Verbs, store: Path, keys: Path, tmp_path: Path) -> None:
     before = contents(store)
     (keys / "root.pem").rename(tmp_path / "root.pem")
@@ -420,6 +434,7 @@ def test_what_a_rotation_needs(shmmap: Verbs, store: Path, keys: Path, tmp_path:
     assert not list(keys.glob("*.next.pem"))
 
 
+@pytest.mark.slow
 def test_a_key_that_is_lost_is_rotated(shmmap: Verbs, town: DividedMap, store: Path, keys: Path) -> None:
     (keys / "online.pem").unlink()
     assert "No such file" in shmmap("versions", store, "--refresh", "--sign", keys, code=78)
@@ -430,6 +445,7 @@ def test_a_key_that_is_lost_is_rotated(shmmap: Verbs, town: DividedMap, store: P
     assert shmmap.json("versions", store, "--trust", keys / "ROOT.json")["current"] == 2
 
 
+@pytest.mark.slow
 def test_a_publisher_with_the_old_key_leaves_a_valid_map(
     shmmap: Verbs, town: DividedMap, store: Path, keys: Path, tmp_path: Path
 ) -> None:

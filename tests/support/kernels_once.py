@@ -54,7 +54,9 @@ class _Finder(MetaPathFinder):
         spec = PathFinder.find_spec(fullname, path, target)
         if spec is not None and spec.loader is not None:
             late = fullname in self._late
-            spec.loader = _Late(spec.loader) if late else _Locked(spec.loader, self._locks)
+            spec.loader = (
+                _Late(spec.loader, Path(str(spec.origin))) if late else _Locked(spec.loader, self._locks)
+            )
         return spec
 
 
@@ -63,13 +65,14 @@ class _LateModule(types.ModuleType):
 
     def __getattr__(self, name: str) -> Any:
         loader = self.__spec__.loader if self.__spec__ is not None else None
-        if not name.startswith("__") and isinstance(loader, _Late):
+        if isinstance(loader, _Late) and name in loader.text:  # pytest looks for its own in all that it finds
             loader.execute(self)
         return types.ModuleType.__getattribute__(self, name)  # its class is another one now
 
 
 class _Late(Loader):
-    def __init__(self, loader: Loader) -> None:
+    def __init__(self, loader: Loader, source: Path) -> None:
+        self.text = source.read_text(encoding="utf-8")
         self._loader = loader
         self._lock = threading.RLock()
         self._begun = False

@@ -7,6 +7,7 @@ How long the client's import takes is measured by ``tests/benchmarks/import_clie
 from __future__ import annotations
 
 import ast
+import functools
 import importlib
 import json
 import pkgutil
@@ -154,12 +155,18 @@ def source(module: str) -> Path:
     return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
 
 
+@functools.cache
+def parsed(path: Path) -> ast.Module:
+    """Return what a file says; it is the same to the end of the tests."""
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
 def imported(module: str, *, lazy: bool = True) -> Iterator[str]:
     """Every module of ours that a module imports; what only types need is left out.
 
     With ``lazy`` also what it imports in functions.
     """
-    tree = ast.parse(source(module).read_text(encoding="utf-8"))
+    tree = parsed(source(module))
     for node in _run(tree.body, lazy=lazy):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
@@ -222,7 +229,7 @@ def test_no_imports_in_a_circle() -> None:
 @pytest.mark.parametrize("module", modules(CLIENTS))
 def test_programs_use_public_names_alone(module: str) -> None:
     """But for kernels, archives, pictures, private caches, lazy imports, and command lines."""
-    for node in ast.walk(ast.parse(source(module).read_text(encoding="utf-8"))):
+    for node in ast.walk(parsed(source(module))):
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "shmmap":
             if module == "shmmap_clients.command_line" and node.module == "shmmap.cli.programs":
                 continue

@@ -84,6 +84,7 @@ def test_real_scans_on_a_real_map(daemon: Factory, data_dir: Path, tmp_path: Pat
         writer.finish()
     one = daemon(tmp_path / "map")
     trajectory = read_trajectory(data_dir / "kitti0005_scans" / "poses_heldout_tum.txt")
+    places = cloud.astype(np.float64)
     scans = list(ScanSequence(data_dir / "kitti0005_scans", trajectory))[3::8]
     tree = cKDTree(cloud)
     rule = CompareRule("distance", 0.5)
@@ -99,6 +100,6 @@ def test_real_scans_on_a_real_map(daemon: Factory, data_dir: Path, tmp_path: Pat
             assert 0.002 < kept.mean() < 0.08
             # no tree at all for a few: every point of the map
             for row in np.random.default_rng(1).choice(len(points), 20, replace=False):
-                away = cloud.astype(np.float64) - points[row]
+                away = places - points[row]
                 assert kept[row] == bool(((away**2).sum(axis=1) > 0.25).all())
         compare.use_cells(())

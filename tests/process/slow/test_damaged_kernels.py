@@ -16,6 +16,7 @@ import pytest
 
 import shmmap
 from shmmap import kernel_cache
+from shmmap.chunks import applying_kernels, marking_kernels
 from shmmap.layers.build import compile_kernels
 from tests.process.conftest import DaemonFactory
 from tests.support.command_line import Shmmap
@@ -41,9 +42,8 @@ def a_directory(path: Path) -> None:
 @pytest.fixture
 def kernels(tmp_path: Path) -> Path:
     """Return a copy of the kernels that all tests use."""
-    import shmmap.chunks.applying_kernels
-    import shmmap.chunks.marking_kernels  # noqa: F401  compiled as they are imported
-
+    for module in (applying_kernels, marking_kernels):
+        assert module.__all__, "they are compiled when one of them is looked for"
     compile_kernels()
     used = kernel_cache.kernel_directory()
     assert used is not None
