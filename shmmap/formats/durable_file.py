@@ -15,6 +15,7 @@ from shmmap.errors import CannotWrite, ShmmapError
 
 __all__ = ["appearing_file", "flush_directory", "locked_entry", "locked_file", "writing_errors"]
 
+_LOCK_FLAGS: Final = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 _ELSEWHERE: Final = "choose a directory that this user may write to"
 _HINTS: Final = {
     errno.ENOSPC: "free some space, or choose another disk",
@@ -67,7 +68,7 @@ def appearing_file(path: str | os.PathLike[str], *, replace: bool = True) -> Ite
 @contextlib.contextmanager
 def locked_file(path: str, *, mode: int = 0o600) -> Iterator[None]:
     """Wait for a file's exclusive lock and hold it; a missing file is created with ``mode``."""
-    fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, mode)
+    fd = os.open(path, _LOCK_FLAGS, mode)
     try:
         fcntl.flock(fd, fcntl.LOCK_EX)
         yield
@@ -95,7 +96,7 @@ def locked_entry(directory: str, name: str, kind: int, *, mode: int = 0o777) -> 
     path = os.path.join(directory, name)
     while True:
         os.makedirs(directory, mode=mode, exist_ok=True)
-        fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        fd = os.open(path, _LOCK_FLAGS, 0o600)
         with contextlib.ExitStack() as undo:
             undo.callback(os.close, fd)
             fcntl.flock(fd, kind)

@@ -228,7 +228,7 @@ def test_no_imports_in_a_circle() -> None:
 
 @pytest.mark.parametrize("module", modules(CLIENTS))
 def test_programs_use_public_names_alone(module: str) -> None:
-    """But for kernels, archives, pictures, private caches, lazy imports, and command lines."""
+    """But for kernels, archives, pictures, caches, lazy imports, and command lines."""
     for node in ast.walk(parsed(source(module))):
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "shmmap":
             if module == "shmmap_clients.command_line" and node.module == "shmmap.cli.programs":

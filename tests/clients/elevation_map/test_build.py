@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from shmmap_clients.elevation_map.build import Checkpoint, Journal, far_cells
+from shmmap_clients.elevation_map.build import Checkpoint, Journal, _alone, far_cells
 from shmmap_clients.elevation_map.seams import Columns, Seams
 
 
@@ -91,3 +91,23 @@ def test_a_checkpoint_brings_back_what_waits(tmp_path: Path, monkeypatch: pytest
     assert sorted(released.values[:, 0].tolist()) == [8, 8, 11]
     (tmp_path / "seams-2.npz").write_bytes(b"torn")
     assert journal.read(Seams(boxes)) is None
+
+
+@pytest.mark.parametrize("planted", ["link", "writable", "lock"])
+def test_a_planted_directory_of_the_cache_is_refused(tmp_path: Path, planted: str) -> None:
+    """Nothing is emptied, and a file to which the lock leads is not cut."""
+    victim = tmp_path / "victim"
+    victim.mkdir()
+    (victim / "mine").write_text("mine")
+    cache = tmp_path / "cache"
+    cache.mkdir()
+    if planted == "link":
+        (cache / "key").symlink_to(victim)
+    elif planted == "lock":
+        (cache / "key.lock").symlink_to(victim / "mine")
+    else:
+        (cache / "key").mkdir()
+        (cache / "key").chmod(0o777)
+    with pytest.raises(OSError, match=r"key"), _alone(cache, "key"):
+        pytest.fail("it was taken")
+    assert (victim / "mine").read_text() == "mine"

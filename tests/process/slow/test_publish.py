@@ -10,9 +10,11 @@ import re
 import shutil
 import signal
 import tempfile
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -621,6 +623,32 @@ def test_what_an_interrupted_fetch_left_is_verified(
     assert files_of(out / "pointcloud_map.pcd") == files_of(town.pcd_dir)
     assert sorted(os.listdir(out)) == sorted([*os.listdir(town.root), "shmmap_divide.json"])
     assert not aside.exists() or aside.read_bytes() == whole
+
+
+def test_objects_are_unpacked_within_a_limit(
+    store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With room for less than one, they are unpacked one after another."""
+    from shmmap.publishing import fetch
+
+    at_work, most = [0], [0]
+    lock = threading.Lock()
+    real = fetch.rows_of
+
+    def counted(*arguments: Any) -> Any:
+        with lock:
+            at_work[0] += 1
+            most[0] = max(most[0], at_work[0])
+        try:
+            return real(*arguments)
+        finally:
+            with lock:
+                at_work[0] -= 1
+
+    monkeypatch.setattr(fetch, "rows_of", counted)
+    monkeypatch.setattr(fetch, "memory_left", lambda limit: limit >> 30)
+    done = fetch.fetch_map(open_store(str(store)), str(tmp_path / "back"), progress=NoProgress())
+    assert (done.fetched_cells, most) == (4, [1])
 
 
 @pytest.mark.parametrize(("owner", "problem"), [(0, "is a symbolic link"), (OTHER_USER, "belongs to user")])

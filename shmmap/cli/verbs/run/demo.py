@@ -171,4 +171,4 @@ def _picture_path(named: str | None, usual: str) -> Path:
         return path
     if named:
         raise CannotWrite(f"{path} cannot be written", hint="give another --svg FILE")
-    return Path(tempfile.gettempdir(), path.name)
+    return Path(tempfile.mkdtemp(prefix="shmmap-"), path.name)  # a name in /tmp could be another's link
