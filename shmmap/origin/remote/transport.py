@@ -193,5 +193,8 @@ def call_apart(call: Callable[[], _Answer]) -> _Answer:
         except BaseException as error:  # noqa: BLE001  raised in the main thread
             future.set_exception(error)
 
-    threading.Thread(target=run, name="request", daemon=True).start()
+    try:
+        threading.Thread(target=run, name="request", daemon=True).start()
+    except RuntimeError:  # the system allows no more threads
+        return call()
     return future.result()
