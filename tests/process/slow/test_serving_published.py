@@ -666,11 +666,13 @@ def test_what_cannot_be_served_is_refused(
     assert "secret@" not in one.log
 
 
-@pytest.mark.parametrize("package", ["obstore", "zstandard"])
+@pytest.mark.parametrize(
+    ("package", "url"), [("obstore", "s3://m/map"), ("zstandard", "http://127.0.0.1:9/map")]
+)
 def test_without_a_package_it_is_said_what_to_install(
-    daemon: DaemonFactory, tmp_path: Path, package: str
+    daemon: DaemonFactory, tmp_path: Path, package: str, url: str
 ) -> None:
-    one = daemon("http://127.0.0.1:9/map", start=False, environment=without(package, tmp_path))
+    one = daemon(url, start=False, environment=without(package, tmp_path))
     assert one.run_to_end() == 69
     assert "pip install obstore zstandard" in one.log
 
