@@ -61,6 +61,7 @@ _SILENT: Final = "is the network up, and the address right? (s3:// has it of AWS
 _REGION: Final = "is AWS_REGION that of the bucket?"
 _CERTIFICATE: Final = "SSL_CERT_FILE names further authorities; is the clock right?"
 _CLOCK: Final = "are the credentials valid, and is the clock right?"
+_ELSEWHERE: Final = "the bucket is in another region"
 _CODE: Final = re.compile(r"<Code>(\w+)</Code>")
 _REASONS: Final = {
     "ExpiredToken": "the credentials have expired",
@@ -70,8 +71,29 @@ _REASONS: Final = {
     "SignatureDoesNotMatch": "the secret does not belong to the access key",
     "RequestTimeTooSkewed": "this machine's clock differs from the store's",
     "AccessDenied": "no permission",
+    "AllAccessDisabled": "the bucket's owner has disabled it",
+    "AccountProblem": "the account is closed or not paid for",
+    "InvalidBucketName": "no bucket can have this name",
+    "PermanentRedirect": _ELSEWHERE,
+    "TemporaryRedirect": _ELSEWHERE,
+    "AuthorizationHeaderMalformed": _ELSEWHERE,
+    "IllegalLocationConstraintException": _ELSEWHERE,
+    "AuthenticationFailed": "the account's key or token is not valid",
+    "AuthorizationFailure": "no permission",
+    "AuthorizationPermissionMismatch": "no permission",
+    "InsufficientAccountPermissions": "no permission",
+    "NoAuthenticationInformation": "it takes no requests without credentials",
+    "PublicAccessNotPermitted": "it takes no requests without credentials",
+    "ContainerBeingDeleted": "the container is being deleted",
+    "AccountIsDisabled": "the account is closed or not paid for",
 }
-"""Meanings of Amazon's error codes, which other stores use, too."""
+"""Meanings of Amazon's error codes, which Google and others use, too, and of Azure's."""
+_HINTS: Final = {
+    _ELSEWHERE: _REGION,
+    "no permission": "may this account use this bucket? Its policy, or the account's roles, say so",
+    "the container is being deleted": _AGAIN,
+}
+"""Hints for reasons that are none of the credentials."""
 _NO_BUCKET: Final = re.compile(
     r"<Code>(NoSuchBucket|ContainerNotFound)</Code>|The specified (bucket|container) does not exist"
 )
@@ -257,9 +279,13 @@ class BucketStore:
         except exceptions.NotModifiedError:  # only `get_if_changed` sets this condition
             raise
         except (exceptions.PermissionDeniedError, exceptions.UnauthenticatedError) as error:
-            why = _reason(str(error)) or "no permission"
+            why = _reason(str(error))
+            hint = _HINTS.get(why, _CLOCK)
             raise StoreRefused(
-                f"{self._name(path)}: refused, {why}", hint=_CLOCK, of_credentials=True, status=403
+                f"{self._name(path)}: refused, {why or 'no permission'}",
+                hint=hint,
+                of_credentials=True,
+                status=403,
             ) from None
         except (exceptions.BaseError, OSError) as error:
             raise _out_of_reach(self._name(path), str(error)) from None
@@ -328,6 +354,7 @@ def _out_of_reach(name: str, text: str) -> Offline:
         status = int(found[1] or found[2])
         hint = _CLOCK if 400 <= status < 500 else _AGAIN
         if why := _reason(text):
+            hint = _HINTS.get(why, hint)
             return StoreRefused(f"{name}: refused, {why}", hint=hint, of_credentials=True, status=status)
         return StoreRefused(f"{name}: refused (status {status})", hint=hint, status=status)
     if "redirect" in text.lower():
