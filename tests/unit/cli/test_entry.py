@@ -111,10 +111,11 @@ def test_a_reader_that_went_away_is_no_error() -> None:
     assert (done.returncode, done.stderr) == (141, b"")
 
 
-def test_a_full_disk_is_no_defect() -> None:
+@pytest.mark.parametrize("words", ["version", "--version", "--help", "serve --help"])
+def test_a_full_disk_is_no_defect(words: str) -> None:
     with open("/dev/full", "w", encoding="utf-8") as full:
         done = subprocess.run(
-            [sys.executable, "-m", "shmmap.cli", "version"],
+            [sys.executable, "-m", "shmmap.cli", *words.split()],
             stdout=full,
             stderr=subprocess.PIPE,
             text=True,
