@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Callable, Container, Iterable, Sequence
 from pathlib import Path
 from types import FrameType
-from typing import Any, Final, NoReturn
+from typing import IO, Any, Final, NoReturn
 
 from shmmap.cli.compiling_lines import CompilingLines
 from shmmap.compile_notices import watch
@@ -71,12 +71,12 @@ class Parser(argparse.ArgumentParser):
             self._refuse(f"unknown option {word}", word)
         self._refuse(f"unexpected argument: {' '.join(unknown)}", word)
 
-    def _print_message(self, message: str, file: Any = None) -> None:
-        """Write help or a version; argparse itself ignores errors of writing."""
-        if file is sys.stdout and message:
-            file.write(message)
-        else:
-            super()._print_message(message, file)
+    def _print_message(self, message: str, file: IO[str] | None = None) -> None:
+        # argparse ignores errors of writing here, so that help for a full disk would be lost with exit code 0
+        if message:
+            stream = file or sys.stderr
+            stream.write(message)
+            stream.flush()
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if isinstance(action, argparse._SubParsersAction) and value not in action.choices:

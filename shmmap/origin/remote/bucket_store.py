@@ -112,6 +112,7 @@ _ASKED_FOR_CREDENTIALS: Final = (
 )
 """Variables with the URL of a server that obstore asks for credentials, or of a store."""
 _BYTES_PER_PAGE: Final = 1 << 19
+_ELSEWHERE: Final = "the bucket is in another region"
 _CODE: Final = re.compile(r"<Code>(\w+)</Code>")
 _REASONS: Final = {
     "ExpiredToken": "the credentials have expired",
@@ -121,8 +122,29 @@ _REASONS: Final = {
     "SignatureDoesNotMatch": "the secret does not belong to the access key",
     "RequestTimeTooSkewed": "this machine's clock differs from the store's",
     "AccessDenied": "no permission",
+    "AllAccessDisabled": "the bucket's owner has disabled it",
+    "AccountProblem": "the account is closed or not paid for",
+    "InvalidBucketName": "no bucket can have this name",
+    "PermanentRedirect": _ELSEWHERE,
+    "TemporaryRedirect": _ELSEWHERE,
+    "AuthorizationHeaderMalformed": _ELSEWHERE,
+    "IllegalLocationConstraintException": _ELSEWHERE,
+    "AuthenticationFailed": "the account's key or token is not valid",
+    "AuthorizationFailure": "no permission",
+    "AuthorizationPermissionMismatch": "no permission",
+    "InsufficientAccountPermissions": "no permission",
+    "NoAuthenticationInformation": "it takes no requests without credentials",
+    "PublicAccessNotPermitted": "it takes no requests without credentials",
+    "ContainerBeingDeleted": "the container is being deleted",
+    "AccountIsDisabled": "the account is closed or not paid for",
 }
-"""Meanings of Amazon's error codes, which other stores use, too."""
+"""Meanings of Amazon's error codes, which Google and others use, too, and of Azure's."""
+_HINTS: Final = {
+    _ELSEWHERE: _REGION,
+    "no permission": "may this account use this bucket? Its policy, or the account's roles, say so",
+    "the container is being deleted": _AGAIN,
+}
+"""Hints for reasons that are none of the credentials."""
 _NO_BUCKET: Final = re.compile(
     r"<Code>(NoSuchBucket|ContainerNotFound)</Code>|The specified (bucket|container) does not exist"
 )
@@ -364,9 +386,10 @@ def _failure(name: str, error: BaseException) -> Offline:
     if is_panic(error):
         return Offline(f"{name}: the request has made the package obstore fail", hint=_PANIC)
     if isinstance(error, exceptions.PermissionDeniedError | exceptions.UnauthenticatedError):
+        why = _reason(text)
         return StoreRefused(
-            f"{name}: refused, {_reason(text) or 'no permission'}",
-            hint=_CLOCK,
+            f"{name}: refused, {why or 'no permission'}",
+            hint=_HINTS.get(why, _CLOCK),
             of_credentials=True,
             status=403,
         )
@@ -441,6 +464,12 @@ def _out_of_reach(name: str, text: str) -> Offline:
     """Return our error for the text of an obstore error; only parts without secrets are repeated."""
     if _NO_BUCKET.search(text):
         return NoBucket(f"{name}: there is no such bucket", status=404)
+    found = _STATUS.search(text)
+    status = int(found[1] or found[2]) if found is not None else 0
+    hint = _CLOCK if 400 <= status < 500 else _AGAIN
+    if why := _reason(text):
+        hint = _HINTS.get(why, hint)
+        return StoreRefused(f"{name}: refused, {why}", hint=hint, of_credentials=True, status=status)
     if _NOWHERE in text or "redirect" in text.lower() or _MOVED.search(text):
         return StoreRefused(f"{name}: refused, it is somewhere else", hint=_REGION)
     if _UNASKED.search(text):
@@ -450,12 +479,7 @@ def _out_of_reach(name: str, text: str) -> Offline:
     for part, says, hint in _TRUE_NAMES:
         if part in text:
             return StoreRefused(f"{name}: {says}", hint=hint)
-    found = _STATUS.search(text)
-    if found is not None:
-        status = int(found[1] or found[2])
-        hint = _CLOCK if 400 <= status < 500 else _AGAIN
-        if why := _reason(text):
-            return StoreRefused(f"{name}: refused, {why}", hint=hint, of_credentials=True, status=status)
+    if status:
         return StoreRefused(f"{name}: refused (status {status})", hint=hint, status=status)
     if "certificate" in text.lower():
         return StoreRefused(f"{name}: the server's certificate is not accepted", hint=_CERTIFICATE)

@@ -15,11 +15,13 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import math
 import os
 import re
 import secrets
 import stat
 import threading
+import time
 from collections.abc import Iterable, Iterator
 from hashlib import sha256
 from typing import Final, NamedTuple
@@ -38,6 +40,8 @@ __all__ = ["KeptObjects", "ObjectCounts", "ObjectTier", "kept_objects"]
 
 _BLOB: Final = re.compile("blobs/sha256/([0-9a-f]{64})")
 _ABSENT: Final = (errno.ENOENT, errno.ESTALE)
+_FULL: Final = (errno.ENOSPC, errno.EDQUOT)
+_SAID_AGAIN_S: Final = 3600.0
 _NEVER_RIGHT: Final = (errno.ELOOP, errno.ENXIO, errno.EIO)  # symbolic link, socket, bad block
 
 
@@ -45,7 +49,7 @@ class ObjectTier:
     """The objects kept in one cache directory; thread-safe.
 
     No method raises for disk errors: the object then counts as missing, or is not kept, and the reason is
-    logged once.
+    logged, each at most once an hour.
 
     Parameters
     ----------
@@ -54,7 +58,8 @@ class ObjectTier:
     limit_bytes
         Size limit of all files in it, computed layers included; 0: no object is kept.
     quiet
-        Log nothing, because another process of the same daemon does.
+        Log only that the disk is full, which other processes of the same daemon may not notice; they log the
+        rest.
     """
 
     def __init__(self, cache_dir: str, *, limit_bytes: int, quiet: bool = False) -> None:
@@ -65,7 +70,7 @@ class ObjectTier:
         self._lock = threading.Lock()
         self._trimmer: threading.Thread | None = None
         self._trim_again = False
-        self._said: set[str] = set()
+        self._said_s: dict[str, float] = {}
         self._damaged = 0
 
     @property
@@ -188,13 +193,14 @@ class ObjectTier:
         return f"{self.directory}: {error.strerror}"
 
     def _say(self, error: OSError) -> None:
-        if self._quiet or error.errno in _ABSENT:
+        if error.errno in _ABSENT or (self._quiet and error.errno not in _FULL):
             return
         reason = self._reason(error)
+        now_s = time.monotonic()
         with self._lock:
-            if reason in self._said:
+            if now_s - self._said_s.get(reason, -math.inf) < _SAID_AGAIN_S:
                 return
-            self._said.add(reason)
+            self._said_s[reason] = now_s
         log.warning("objects not kept on disk", reason=reason)
 
 

@@ -123,6 +123,12 @@ def test_a_full_disk(private_tmpfs: Callable[[str], str], caplog: pytest.LogCapt
         assert tier.get(first, len(made[first])) == made[first]
     assert caplog.text.count("objects not kept on disk") == 1
     assert "No space left" in caplog.text
+    loader = ObjectTier(
+        str(cache), limit_bytes=1 << 30, quiet=True
+    )  # the daemon's own pages may all be there
+    for _ in range(3):
+        assert not loader.put(second, made[second])
+    assert caplog.text.count("objects not kept on disk") == 2
     filler.unlink()
     assert tier.put(second, made[second])
     assert tier.get(second, len(made[second])) == made[second]

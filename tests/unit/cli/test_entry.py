@@ -111,7 +111,7 @@ def test_a_reader_that_went_away_is_no_error() -> None:
     assert (done.returncode, done.stderr) == (141, b"")
 
 
-@pytest.mark.parametrize("words", ["version", "--help", "query --help", "--version"])
+@pytest.mark.parametrize("words", ["version", "--version", "--help", "query --help"])
 def test_a_full_disk_is_no_defect(words: str) -> None:
     with open("/dev/full", "w", encoding="utf-8") as full:
         done = subprocess.run(

@@ -264,3 +264,52 @@ def test_a_bucket_that_is_not_there(buckets: BucketServer, ask: str) -> None:
         NO_BUCKET[ask](store)
     assert (caught.value.exit_code, caught.value.hint) == (66, "make the bucket first, or correct its name")
     del buckets
+
+
+BODY = "<?xml version='1.0' encoding='utf-8'?><Error><Code>{}</Code><Message>{}</Message></Error>"
+MISSING = "there is no such bucket"
+
+
+MALFORMED = BODY.format("AuthorizationHeaderMalformed", "expecting 'eu-west-1'")
+AZURE = BODY.format("AuthorizationPermissionMismatch", "")
+REFUSED = BODY.format("AuthenticationFailed", "Signature did not match")
+
+
+@pytest.mark.parametrize(
+    ("scheme", "status", "body", "says", "hint", "code"),
+    [
+        ("s3", 404, BODY.format("NoSuchBucket", "The specified bucket does not exist"), MISSING, "make", 66),
+        ("s3", 404, BODY.format("NoSuchKey", "NoSuchBucket"), "CURRENT is not there", "", 66),
+        ("s3", 404, '{"error": {"message": "The specified bucket does not exist."}}', MISSING, "make", 66),
+        ("az", 404, BODY.format("ContainerNotFound", "it does not exist."), MISSING, "make", 66),
+        ("az", 404, BODY.format("BlobNotFound", "it does not exist."), "CURRENT is not there", "", 66),
+        ("s3", 301, BODY.format("PermanentRedirect", "use the endpoint"), "somewhere else", "AWS_REGION", 75),
+        ("s3", 400, MALFORMED, "in another region", "AWS_REGION", 75),
+        ("s3", 403, BODY.format("AccessDenied", "it may not exist"), "no permission", "may this account", 75),
+        ("az", 403, AZURE, "no permission", "may this account", 75),
+        ("az", 403, REFUSED, "key or token is not valid", "are the credentials valid", 75),
+        ("s3", 400, BODY.format("InvalidBucketName", ""), "no bucket can have this name", "", 75),
+    ],
+)
+def test_what_stores_say_of_a_bucket(
+    scheme: str,
+    status: int,
+    body: str,
+    says: str,
+    hint: str,
+    code: int,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with closing(StoreProxy("http://127.0.0.1:9")) as server:
+        server.rule = lambda *_: Answer(status, {"content-type": "application/xml"}, body.encode())
+        for name in ("AWS_ENDPOINT_URL", "AZURE_ENDPOINT"):
+            monkeypatch.setenv(name, server.endpoint)
+        for name in ("AZURE_STORAGE_ACCOUNT_NAME", "AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+            monkeypatch.setenv(name, "account")
+        store = open_store(f"{scheme}://some/map", timeouts=ONCE)
+        with pytest.raises(ShmmapError) as caught:
+            store.get_tagged("CURRENT", 99)
+        assert says in caught.value.message
+        assert hint in caught.value.hint
+        assert caught.value.exit_code == code
+        assert server.requests()
