@@ -262,11 +262,12 @@ class MapInMemory:
 
     def close(self, *, keep: bool) -> None:
         """End the loaders, and remove every name; with ``keep`` leave the segments' names to the next run."""
-        self.scheduler.pool.close()
-        self.adoption.close(keep=keep)
-        self.cache.close(keep=keep)
-        self.statistics.close()
-        self.watched.close()
+        with contextlib.ExitStack() as stack:  # each step is taken, whatever happens in those before
+            stack.callback(self.watched.close)
+            stack.callback(self.statistics.close)
+            stack.callback(self.cache.close, keep=keep)
+            stack.callback(self.adoption.close, keep=keep)
+            stack.callback(self.scheduler.pool.close)
 
 
 def _identity(

@@ -167,9 +167,12 @@ def add_stop(subparsers: Subparsers) -> None:
 
 def run_stop(args: argparse.Namespace) -> int:
     """Ask the daemon to stop."""
-    with connect(args) as client:
-        pid = client.welcome.pid
-        client.shutdown()
+    try:
+        with connect(args) as client:
+            pid = client.welcome.pid
+            client.shutdown()
+    except ProtocolMismatch as error:
+        raise ProtocolMismatch(error.message, hint="a signal ends a daemon of any version: " + _by_signal(args))
     if args.json:
         from shmmap.cli.verbs.cells import outputs
 
