@@ -12,7 +12,7 @@ import _ast  # `ast` itself takes a millisecond to load
 import importlib
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, Final
 
 from shmmap.errors import PackageMissing
@@ -102,7 +102,7 @@ def lazy_names(package: str) -> Callable[[str], Any]:
     package
         The package's ``__name__``.
     """
-    _names.setdefault(package, {})
+    _names[package] = {}
 
     def load(name: str) -> Any:
         module = None if name.startswith("__") else public_names(package).get(name)
@@ -138,7 +138,8 @@ def lazy_public_names(package: str) -> Callable[[str], Any]:
 def know_names() -> None:
     """Read now which public names the packages have that are imported: later an upgrade may replace them."""
     for package in tuple(_names):
-        public_names(package)
+        with suppress(ImportError):  # installed without its source
+            public_names(package)
 
 
 def public_names(package: str) -> dict[str, str]:

@@ -74,7 +74,7 @@ from shmmap.origin.remote.store import is_published, is_url, read_url
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import prepare_process
 from shmmap.statistics.exclusive_name import refuse_second
-from shmmap.version import __version__
+from shmmap.version import build_version
 
 if TYPE_CHECKING:
     from shmmap.daemon.map.published_origin import PublishedOrigin
@@ -112,7 +112,9 @@ def run(config: DaemonConfig) -> int:
         )
     if is_url(config.map_path):
         read_url(config.map_path)  # check before logging: an invalid URL may contain a secret
-    log.info("starting", version=__version__, instance=config.instance, map=config.map_path, pid=os.getpid())
+    log.info(
+        "starting", version=build_version(), instance=config.instance, map=config.map_path, pid=os.getpid()
+    )
     remember_modules()
     early = fork_early()
     prepare_process()

@@ -40,7 +40,7 @@ from shmmap.segment.names import segment_prefix
 from shmmap.segment.process_limits import limit_behind
 from shmmap.statistics.identity import DaemonIdentity, pid_namespace, start_time_ticks
 from shmmap.statistics.writer import StatisticsWriter
-from shmmap.version import __version__
+from shmmap.version import build_version
 
 __all__ = ["FetchedFrom", "MapInMemory", "bytes_beside_cells", "place_live_maps"]
 
@@ -284,7 +284,7 @@ def _identity(
         map_version=catalogue.map_version,
         shm_dir=shm_dir,
         id_prefix=catalogue.id_prefix,
-        library_version=__version__,
+        library_version=build_version(),
         started_unix_ns=time.time_ns(),
         frame_id=catalogue.frame_id,
     )

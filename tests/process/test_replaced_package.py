@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The package is removed or replaced under running programs: what they have goes on, the rest says why not."""
+"""The package is removed or replaced under programs that run: all they have goes on, the rest is refused."""
 
 from __future__ import annotations
 
