@@ -111,7 +111,11 @@ if not TYPE_CHECKING:  # type checkers report names that are not in the list
             return _load(name)
         except AttributeError:
             for package in _PACKAGES:
-                if name in importlib.import_module(f"shmmap.{package}").__all__:
+                try:
+                    names = importlib.import_module(f"shmmap.{package}").__all__
+                except ShmmapError:  # it was replaced: where the name is cannot be said
+                    continue
+                if name in names:
                     error = AttributeError(
                         f"module 'shmmap' has no attribute {name!r}: it is shmmap.{package}.{name}"
                     )

@@ -35,6 +35,7 @@
     │   ├── NoSpace            the shared-memory file system is full
     │   └── Offline            its origin cannot be reached at present           exit 75
     ├── PackageMissing         a Python package is not installed                  exit 69
+    ├── Replaced               shmmap was upgraded under this process             exit 69
     └── InternalError          a defect in shmmap: please report it               exit 70
 
 ``code`` is the error's name in the protocol, ``exit_code`` the command's exit code, ``hint`` the remedy.
@@ -77,6 +78,7 @@ __all__ = [
     "OverBudget",
     "PackageMissing",
     "ProtocolMismatch",
+    "Replaced",
     "SegmentCorrupt",
     "SegmentError",
     "ShmmapError",
@@ -362,6 +364,13 @@ class PackageMissing(ShmmapError, ImportError):
 
     code = "package_missing"
     exit_code = 69
+
+
+class Replaced(ShmmapError):
+    """shmmap was upgraded or removed while this process runs: what was not loaded before cannot be loaded."""
+
+    code = "replaced"
+    exit_code = 69  # EX_UNAVAILABLE of sysexits.h
 
 
 class InternalError(ShmmapError):

@@ -12,13 +12,22 @@ import _ast  # `ast` itself takes a millisecond to load
 import importlib
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, Final
 
 from shmmap.errors import PackageMissing
+from shmmap.installed import refuse_if_replaced
 from shmmap.segment.process_limits import no_files_left
 
-__all__ = ["FOR_REMOTE", "TO_SIGN", "lazy_names", "lazy_public_names", "needed_packages", "public_names"]
+__all__ = [
+    "FOR_REMOTE",
+    "TO_SIGN",
+    "know_names",
+    "lazy_names",
+    "lazy_public_names",
+    "needed_packages",
+    "public_names",
+]
 
 FOR_REMOTE: Final = "obstore zstandard"
 """Packages for a published map: the extra ``remote``."""
@@ -41,6 +50,9 @@ _OPTIONAL: Final = frozenset(
 """Packages that an ordinary installation lacks: `project.optional-dependencies`."""
 
 _OURS: Final = ("shmmap", "shmmap_clients")
+
+_names: dict[str, dict[str, str]] = {}
+"""Module of each public name, by package; empty until the package's source has been read."""
 
 
 @contextmanager
@@ -90,14 +102,13 @@ def lazy_names(package: str) -> Callable[[str], Any]:
     package
         The package's ``__name__``.
     """
-    modules: dict[str, str] = {}
+    _names[package] = {}
 
     def load(name: str) -> Any:
-        if not modules:
-            modules.update(public_names(package))
-        if name not in modules:
+        module = None if name.startswith("__") else public_names(package).get(name)
+        if module is None:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        value = getattr(importlib.import_module(modules[name]), name)
+        value = getattr(importlib.import_module(module), name)
         setattr(sys.modules[package], name, value)
         return value
 
@@ -124,6 +135,13 @@ def lazy_public_names(package: str) -> Callable[[str], Any]:
     return load_or_say
 
 
+def know_names() -> None:
+    """Read now which public names the packages have that are imported: later an upgrade may replace them."""
+    for package in tuple(_names):
+        with suppress(ImportError):  # installed without its source
+            public_names(package)
+
+
 def public_names(package: str) -> dict[str, str]:
     """Return the module of each name that a package imports under ``if TYPE_CHECKING:``.
 
@@ -131,7 +149,16 @@ def public_names(package: str) -> dict[str, str]:
     ------
     ImportError
         The package is installed without its source.
+    Replaced
+        The package was replaced before its names were read.
     """
+    if not (found := _names.get(package)):
+        refuse_if_replaced(package)
+        found = _names[package] = _read_names(package)
+    return found
+
+
+def _read_names(package: str) -> dict[str, str]:
     spec: Any = sys.modules[package].__spec__
     source = spec.loader.get_source(package)
     if source is None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 from collections.abc import Callable, Iterable, Sequence
 from types import TracebackType
@@ -16,6 +17,8 @@ from shmmap.client.cell_set import CellSet, Held, HeldCells
 from shmmap.client.connection import until_served
 from shmmap.client.discovery import candidates
 from shmmap.client.session import Session
+from shmmap.installed import remember_modules
+from shmmap.lazy_imports import know_names
 from shmmap.protocol import messages
 from shmmap.protocol.messages import Welcome
 
@@ -512,6 +515,17 @@ class Client:
         self._session.ask(messages.Shutdown, messages.Stopping)
 
 
+def _load_all() -> None:
+    """Import what a session may need later: an upgrade may replace the package's files under this program."""
+    for name in (
+        *("lacking", "mounts", "protocol.live"),
+        *("client.handed_over", "client.map_listing", "client.points_around"),
+    ):
+        importlib.import_module(f"shmmap.{name}")
+    know_names()
+    remember_modules()
+
+
 def connect(
     endpoint: str | os.PathLike[str] | None = None,
     *,
@@ -555,6 +569,7 @@ def connect(
     BadRequest
         The endpoint cannot be a socket path, or another argument is invalid.
     """
+    _load_all()
     return Client(
         candidates(endpoint, instance=instance),
         timeout=timeout_s("timeout", timeout),

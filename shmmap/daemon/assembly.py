@@ -48,6 +48,7 @@ from shmmap.daemon.transport.inbox import Inbox
 from shmmap.daemon.transport.socket_file import SocketFile
 from shmmap.errors import ShmmapError
 from shmmap.failpoints import step
+from shmmap.installed import RESTART, is_installed, was_noticed
 from shmmap.logfmt import log
 from shmmap.protocol.codec import MAX_REQUEST_BYTES
 from shmmap.protocol.events import Epoch
@@ -65,6 +66,11 @@ LAST_WORDS_S: Final = 0.2
 
 class Service:
     """The daemon as clients and the service manager see it: sockets, requests, signals and status.
+
+    Attributes
+    ----------
+    replaced : bool
+        Whether shmmap was replaced, and a process was needed that the new version cannot be.
 
     Raises
     ------
@@ -98,6 +104,7 @@ class Service:
         self._lock = lock
         self._elsewhere = elsewhere
         self._file_watch: FileWatch | None = None
+        self.replaced = False
         authorization = Authorization(config.admin_group)
         take_slices(SERVING_SLICE_NS)
         self._connections = Connections()
@@ -317,6 +324,8 @@ class Service:
         self._pins.keep(now_s)
         self._operators.answer_overdue(now_s)
         self._live.beat(now_s)
+        if was_noticed() and not self.replaced:
+            self._on_replaced()
         self._restore_sockets(now_s)
         if self._file_watch is not None and self._file_watch.due(now_s):
             self._reload()
@@ -328,6 +337,16 @@ class Service:
         if version != memory.identity.map_version:
             memory.identity = dataclasses.replace(memory.identity, map_version=version)
             memory.statistics.update_identity(memory.identity)
+
+    def _on_replaced(self) -> None:
+        """Report that shmmap was replaced; under a service manager end: it starts the new version."""
+        self.replaced = True
+        log.error(RESTART)
+        self._memory.statistics.set("package_replaced", 1)
+        if is_installed() and self._manager.starts_again:
+            log.info("stopping", reason="the service manager starts the new version", segments="kept")
+            self._signals.keep = True
+            self._loop.stop(answer=False)
 
     def _collect_reload(self, change: MapChange) -> None:
         if self._elsewhere is not None:  # before the reload is answered

@@ -62,8 +62,9 @@ from shmmap.daemon.service_manager import (
 )
 from shmmap.daemon.transport.socket_file import refuse_taken
 from shmmap.dividing.served_cloud import find_origin
-from shmmap.errors import CannotWrite, ConfigError, ShmmapError
+from shmmap.errors import CannotWrite, ConfigError, Replaced, ShmmapError
 from shmmap.failpoints import step
+from shmmap.installed import remember_modules
 from shmmap.lazy_imports import needed_packages
 from shmmap.logfmt import log, set_up_logging
 from shmmap.origin.catalogue import NoMap
@@ -73,7 +74,7 @@ from shmmap.origin.remote.store import is_published, is_url, read_url
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import prepare_process
 from shmmap.statistics.exclusive_name import refuse_second
-from shmmap.version import __version__
+from shmmap.version import build_version
 
 if TYPE_CHECKING:
     from shmmap.daemon.map.published_origin import PublishedOrigin
@@ -111,7 +112,10 @@ def run(config: DaemonConfig) -> int:
         )
     if is_url(config.map_path):
         read_url(config.map_path)  # check before logging: an invalid URL may contain a secret
-    log.info("starting", version=__version__, instance=config.instance, map=config.map_path, pid=os.getpid())
+    log.info(
+        "starting", version=build_version(), instance=config.instance, map=config.map_path, pid=os.getpid()
+    )
+    remember_modules()
     early = fork_early()
     prepare_process()
     give_back_large_tables()
@@ -173,6 +177,8 @@ def run(config: DaemonConfig) -> int:
         )
         service.run(started_s)
     log.info("stopped", instance=config.instance)
+    if service.replaced and signals.keep:
+        return Replaced.exit_code  # not 0: the service manager then starts the new version
     return CannotWrite.exit_code if live.unsaved else 0
 
 
@@ -259,8 +265,14 @@ def _close(
     kind: type[BaseException] | None,
     *_: object,
 ) -> None:
-    """Close; if a defect ended this run, leave memory to the next run, as after a crash."""
-    closed.close(keep=signals.keep or (kind is not None and not issubclass(kind, ShmmapError)))
+    """Close; if a defect ended this run, leave memory to the next run, as after a crash.
+
+    A defect in it is logged, so that the next step of the close runs as it should.
+    """
+    try:
+        closed.close(keep=signals.keep or (kind is not None and not issubclass(kind, ShmmapError)))
+    except Exception:  # noqa: BLE001  the steps that follow free memory and names
+        log.exception("not closed as it should be", what=type(closed).__name__)
 
 
 def _live_maps(config: DaemonConfig, memory: MapInMemory, gid: int) -> LiveRelay | NoLiveMaps:

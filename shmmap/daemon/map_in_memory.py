@@ -47,7 +47,7 @@ from shmmap.segment.names import segment_prefix
 from shmmap.segment.process_limits import limit_behind
 from shmmap.statistics.identity import DaemonIdentity, pid_namespace, start_time_ticks
 from shmmap.statistics.writer import StatisticsWriter
-from shmmap.version import __version__
+from shmmap.version import build_version
 
 __all__ = ["FetchedFrom", "MapInMemory", "place_live_maps", "share_of_live_maps"]
 
@@ -320,12 +320,13 @@ class MapInMemory:
 
     def close(self, *, keep: bool) -> None:
         """End the loaders, and remove every name; with ``keep`` leave the segments' names to the next run."""
-        self.cache.events.close()
-        self.scheduler.pool.close()
-        self.adoption.close(keep=keep)
-        self.cache.close(keep=keep)
-        self.statistics.close()
-        self.watched.close()
+        with contextlib.ExitStack() as stack:  # each step is taken, whatever happens in those before
+            stack.callback(self.watched.close)
+            stack.callback(self.statistics.close)
+            stack.callback(self.cache.close, keep=keep)
+            stack.callback(self.adoption.close, keep=keep)
+            stack.callback(self.scheduler.pool.close)
+            stack.callback(self.cache.events.close)
 
 
 def _identity(
@@ -342,7 +343,7 @@ def _identity(
         map_version=catalogue.map_version,
         shm_dir=shm_dir,
         id_prefix=catalogue.id_prefix,
-        library_version=__version__,
+        library_version=build_version(),
         started_unix_ns=time.time_ns(),
         frame_id=catalogue.frame_id,
     )

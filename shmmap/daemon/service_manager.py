@@ -86,6 +86,11 @@ class ServiceManager:
         Environment of this process: ``WATCHDOG_USEC`` and ``WATCHDOG_PID`` are used.
     send
         Sends ``KEY=value`` lines.
+
+    Attributes
+    ----------
+    starts_again : bool
+        Whether this process is a service of systemd's, which starts it again after a failure.
     """
 
     def __init__(self, environ: Mapping[str, str] = os.environ, send: Callable[..., None] = notify) -> None:
@@ -95,6 +100,7 @@ class ServiceManager:
         self._status = ""
         self._status_s = -math.inf
         self._reloads = 0
+        self.starts_again = bool(environ.get("NOTIFY_SOCKET")) and bool(environ.get("INVOCATION_ID"))
 
     def ready(self, status: str) -> None:
         """Report that serving starts."""

@@ -19,7 +19,7 @@ from shmmap.quantities import counted, format_bytes
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.names import usual_directory
 from shmmap.statistics.reader import read_statistics
-from shmmap.version import __version__
+from shmmap.version import build_version
 
 __all__ = [
     "check_daemon",
@@ -73,9 +73,9 @@ def check_daemon(diagnosis: Diagnosis) -> Finding:
             f"{fact}; it survived {counted(defects, 'exception')}",
             "please report the tracebacks in its log: journalctl -u shmmapd -g defect",
         )
-    if identity.library_version != __version__:
+    if identity.library_version != build_version():
         return warn(
-            f"{fact}; it is version {identity.library_version}, installed is {__version__}",
+            f"{fact}; it is version {identity.library_version}, installed is {build_version()}",
             "restart it (cells stay in memory): systemctl restart shmmapd",
         )
     return ok(fact)

@@ -17,6 +17,7 @@ from typing import IO, Final, cast
 import msgspec
 
 from shmmap.errors import MapDataError, ShmmapError, error_from_wire
+from shmmap.installed import refuse_if_replaced
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.catalogue_bytes import read_catalogue
 from shmmap.processes.start_child import how_ended
@@ -78,6 +79,7 @@ def read_apart(
     ShmmapError
         The error that the process reported, or that it could not be started or ended early.
     """
+    refuse_if_replaced("shmmap.origin.reread")
     paths = os.pathsep.join(filter(None, sys.path))
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": paths}
     known = f"{before.fixed_digest:016x}" if before is not None else ""

@@ -20,6 +20,7 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from typing import Final, NoReturn
 
+from shmmap import installed
 from shmmap.processes.end_with_parent import die_with
 
 __all__ = [
@@ -36,6 +37,10 @@ __all__ = [
 
 MAX_PACKET_BYTES: Final = 1 << 19
 """Largest packet: a job may name its cell and 65 neighbours by paths of 4095 bytes each."""
+
+_PACKAGE: Final = "SHMMAP_STARTED_BY"
+"""Variable with `shmmap.installed.mark` of the process that started a child."""
+_OTHER_VERSION: Final = 69  # EX_UNAVAILABLE of sysexits.h
 
 _ONE_DESCRIPTOR: Final = socket.CMSG_LEN(array.array("i").itemsize)
 
@@ -102,7 +107,15 @@ def start_child(
     Returns
     -------
     The process, and the parent's end of the channel.
+
+    Raises
+    ------
+    Replaced
+        The package was replaced, so that the child would be of another version.
+    OSError
+        No more processes, memory or descriptors are available at present.
     """
+    installed.refuse_if_replaced(module)
     ours, theirs = channel()
     try:
         with theirs, _interrupts_blocked():
@@ -112,6 +125,7 @@ def start_child(
                 "OMP_NUM_THREADS": "1",
                 **os.environ,
                 "OPENBLAS_NUM_THREADS": "1",
+                _PACKAGE: installed.mark,
                 "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
             }
             process = subprocess.Popen(
@@ -132,7 +146,8 @@ def start_child(
 def channel_to_parent(arguments: Sequence[str]) -> socket.socket:
     """Initialize a child of `start_child`, and return its end of the channel.
 
-    The kernel kills the child when its parent ends, and the parent handles Ctrl-C.
+    The kernel kills the child when its parent ends, and the parent handles Ctrl-C.  A child of another
+    version than its parent ends here: it might misunderstand the parent.
 
     Parameters
     ----------
@@ -140,6 +155,8 @@ def channel_to_parent(arguments: Sequence[str]) -> socket.socket:
         Arguments of the child's program, which begin with ``CHANNEL_FD PARENT_PID``.
     """
     die_with(int(arguments[1]))
+    if os.environ.pop(_PACKAGE, installed.mark) != installed.mark:
+        raise SystemExit(_OTHER_VERSION)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     return socket.socket(fileno=int(arguments[0]))
 

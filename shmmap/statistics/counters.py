@@ -190,6 +190,7 @@ COUNTERS: Final = (
     Counter(
         "sockets_missing", "gauge", "", "Sockets whose files others removed, and that cannot be made again"
     ),
+    Counter("package_replaced", "gauge", "", "1 if shmmap was replaced under the daemon: restart it"),
     *(
         Counter(f"longest_turn_{kind}_ns", "gauge", "ns", f"Longest turn in which {text}")
         for kind, text in TURN_KINDS.items()

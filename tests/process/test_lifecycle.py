@@ -18,6 +18,7 @@ import pytest
 import shmmap
 from shmmap.protocol.rows import CellRow
 from shmmap.statistics.reader import read_statistics
+from shmmap.version import build_version
 from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import DaemonProcess, Deadline, first_answer, until
 from tests.support.divided_map import DividedMap, random_points
@@ -106,7 +107,7 @@ def test_two_instances_side_by_side(
 ) -> None:
     first = served.log.splitlines()[0]
     assert (
-        f"INFO    starting version={shmmap.__version__} instance={served.instance} map={divided_map.root} "
+        f"INFO    starting version={build_version()} instance={served.instance} map={divided_map.root} "
         in first
     )
     two = daemon(divided_map.root, shm_dir=served.shm_dir)

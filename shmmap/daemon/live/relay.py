@@ -21,12 +21,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
+import msgspec
+
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.live import messages
 from shmmap.daemon.transport.connection import Peer
 from shmmap.daemon.transport.sessions import Session
 from shmmap.daemon.turns import WatchedDescriptors
-from shmmap.errors import BadRequest, Busy, LiveInterrupted, ShmmapError, error_from_wire
+from shmmap.errors import BadRequest, Busy, LiveInterrupted, Replaced, ShmmapError, error_from_wire
+from shmmap.installed import RESTART, is_replaced
 from shmmap.logfmt import log
 from shmmap.processes.start_child import packet_buffer, receive_packet, start_child
 from shmmap.protocol import events
@@ -287,7 +290,15 @@ class LiveRelay:
     # --- the worker's process -------------------------------------------------------------------
 
     def start(self) -> None:
-        """Start the worker; `wait_until_serving` waits for its maps."""
+        """Start the worker; `wait_until_serving` waits for its maps.
+
+        Raises
+        ------
+        Replaced
+            shmmap was replaced: a worker would be of another version than this daemon.
+        OSError
+            Not enough processes, memory or descriptors at present.
+        """
         self._process, self._channel = start_child("shmmap.daemon.live.worker.main", new_session=True)
         self._channel.setblocking(False)
         self._serving = False
@@ -349,6 +360,9 @@ class LiveRelay:
         if self._channel is None and now_s >= self._start_s:
             try:
                 self.start()
+            except Replaced:
+                self._start_s = math.inf
+                self._show_problem(RESTART)
             except OSError as error:
                 self._start_s = now_s + PAUSES_S[-1]
                 log.warning("live worker not started", reason=error.strerror)
@@ -367,7 +381,13 @@ class LiveRelay:
             if not data:
                 self._lost()
                 return
-            self._take(messages.decode_from_live(data))
+            try:
+                message = messages.decode_from_live(data)
+            except msgspec.MsgspecError as error:
+                log.error("live worker's message cannot be read", error=error)
+                self._lost()
+                return
+            self._take(message)
         self._flush()
 
     def _take(self, message: messages.FromLive) -> None:
@@ -401,7 +421,10 @@ class LiveRelay:
         self._failures += 1
         log.error("live worker ended", restarts=self.restarts)
         self._events.ended(self.restarts)
-        if self._failures > 1:  # a single failure is harmless: chunks stay in memory
+        if is_replaced():
+            self._start_s = math.inf
+            self._show_problem(RESTART)
+        elif self._failures > 1:  # a single failure is harmless: chunks stay in memory
             self._show_problem("the process of the live maps keeps ending: see the log")
         self._tickets.lose()
 
@@ -448,6 +471,8 @@ class LiveRelay:
             session.connection.reply(encode(LiveListed(message.request, self._rows)))
             return
         if self._channel is None or not self._serving:
+            if math.isinf(self._start_s):
+                raise LiveInterrupted(f"the process that keeps live maps has ended, and {RESTART}")
             raise LiveInterrupted(
                 "the process that keeps live maps is being started",
                 hint="ask again: it takes long the first time",
@@ -524,6 +549,8 @@ class LiveRelay:
         if self._channel is None:
             try:
                 self.start()
+            except Replaced:
+                log.error("live worker not started", reason=RESTART)
             except OSError as error:
                 log.error("live worker not started", reason=error.strerror)
         while self._channel is not None and not self._serving and (left_s := end_s - time.monotonic()) > 0:

@@ -9,10 +9,10 @@ from typing import Final
 
 from shmmap.daemon.host.memory import memory_limit_bytes, out_of_memory_kills
 from shmmap.daemon.loading.loads import Loads
-from shmmap.daemon.loading.prepared_parent import RESTART
 from shmmap.daemon.loading.room import Room
 from shmmap.daemon.loading.worker_pool import Work, Worker, WorkerPool
 from shmmap.daemon.records import Load
+from shmmap.installed import RESTART, is_replaced
 from shmmap.logfmt import log
 from shmmap.quantities import format_bytes
 from shmmap.segment.version import Stamp
@@ -84,7 +84,7 @@ class LostWorkers:
     def _could_not_start(self, worker: Worker, how: str, now_s: float) -> None:
         self.pool.failed_starts += 1
         self.pool.parent.poll()
-        how = how or self.pool.parent.why_not or "its parent has ended"
+        how = RESTART if is_replaced() else how or self.pool.parent.why_not or "its parent has ended"
         log.error("loader could not start", reason=how)
         give_up = how == RESTART or self.pool.failed_starts >= START_ATTEMPTS
         for job, load in self._unfinished(worker):

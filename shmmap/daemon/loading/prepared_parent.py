@@ -7,15 +7,16 @@ import contextlib
 import os
 import socket
 import subprocess
-from pathlib import Path
 from typing import Final, TypeAlias
 
 from shmmap.daemon.turns import WatchedDescriptors
+from shmmap.errors import Replaced
+from shmmap.installed import RESTART, is_replaced
 from shmmap.logfmt import log
 from shmmap.processes.start_child import ForkedProcess, fork_child, how_ended, receive_packet, start_child
 from shmmap.version import __version__
 
-__all__ = ["RESTART", "Early", "PreparedParent", "fork_early"]
+__all__ = ["Early", "PreparedParent", "fork_early"]
 
 Early: TypeAlias = tuple[ForkedProcess, socket.socket]
 """A parent without settings yet, and the channel to it."""
@@ -24,17 +25,6 @@ END_TIMEOUT_S: Final = 0.1
 """How long the loop waits for a killed parent to exit; a parent that hangs in the kernel may never do so."""
 CLOSE_TIMEOUT_S: Final = 5.0
 """Timeout of the same wait when the daemon stops; long, since the machine may be busy."""
-
-RESTART: Final = "shmmap was upgraded or removed while this daemon runs: restart the daemon"
-
-
-def _installed() -> tuple[int, int] | None:
-    """Return what identifies the installed loader program; None if it is gone."""
-    try:
-        status = Path(__file__).with_name("worker_main.py").stat()
-    except OSError:
-        return None
-    return status.st_ino, status.st_mtime_ns
 
 
 def fork_early() -> Early | None:
@@ -83,7 +73,6 @@ class PreparedParent:
         self._process: subprocess.Popen[bytes] | ForkedProcess | None = None
         self._channel: socket.socket | None = None
         self._ready = False
-        self._program = _installed()
         self._buffer = bytearray(64)
 
     @property
@@ -92,7 +81,15 @@ class PreparedParent:
         return self._process.pid if self._process is not None else 0
 
     def start(self) -> None:
-        """Start the parent if there is none; raise OSError if that fails."""
+        """Start the parent if there is none.
+
+        Raises
+        ------
+        Replaced
+            shmmap was replaced: a parent would be of another version than this daemon.
+        OSError
+            Not enough processes, memory or descriptors at present.
+        """
         if self._channel is None:
             early, self._early = self._early, None
             self._process, self._channel = early or start_child(
@@ -109,6 +106,8 @@ class PreparedParent:
 
         Raises
         ------
+        Replaced
+            shmmap was replaced, and there is no parent.
         OSError
             Not enough processes, memory or descriptors at present.
         """
@@ -132,9 +131,9 @@ class PreparedParent:
             was_ready = self._ready
             self.end(RESTART if data else "")
             if was_ready:
-                log.error("loader parent restarted")
-                with contextlib.suppress(OSError):
+                with contextlib.suppress(OSError, Replaced):
                     self.start()
+                    log.error("loader parent restarted")
 
     def close(self) -> None:
         """End the parent, and with it every loader, when the daemon stops."""
@@ -153,5 +152,5 @@ class PreparedParent:
         except subprocess.TimeoutExpired:
             how = "killed, and has not ended yet"
         if not self._ready:
-            self.why_not = RESTART if _installed() != self._program else why or how
+            self.why_not = RESTART if is_replaced() else why or how
         self._process = None

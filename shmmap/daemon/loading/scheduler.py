@@ -34,7 +34,9 @@ from shmmap.daemon.loading.worker_messages import (
 )
 from shmmap.daemon.loading.worker_pool import NOT_OPENED, Opened, Worker, WorkerPool
 from shmmap.daemon.records import SPACE_CODES, Failure, Key, Load, Resident, failure_code
+from shmmap.errors import Replaced
 from shmmap.failpoints import step
+from shmmap.installed import RESTART, is_replaced
 from shmmap.large_tables import ShardedDict
 from shmmap.layers.points import LAYER
 from shmmap.layers.sources import Neighbour
@@ -286,6 +288,10 @@ class Scheduler:
         self._job_numbers += 1
         try:
             taken = self.pool.submit(job, now_s, prefetch=load.prefetch, opened=self._opened)
+        except Replaced:
+            message = f"{job.source.name}: no loader can start: {RESTART}"
+            self._fail(load, "load_failed", message, None, now_s)
+            return True
         except OSError as error:
             self._fail(load, failure_code(error), f"no file for a segment: {error.strerror}", None, now_s)
             return True
@@ -390,6 +396,8 @@ class Scheduler:
                 self._on_checked(load, message, now_s)
             elif isinstance(message, Failed):
                 load.unread = message.unread
+                if message.message.endswith(RESTART):
+                    is_replaced()  # so that the daemon notices, as its loader did
                 self._fail(load, message.code, message.message, message.stamp, now_s)
             elif fd >= 0:
                 step("daemon.received")

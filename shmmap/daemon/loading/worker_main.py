@@ -25,8 +25,9 @@ from shmmap.compile_notices import watch
 from shmmap.daemon.host.scheduling import weigh_less
 from shmmap.daemon.loading import worker_messages
 from shmmap.daemon.records import failure_code
-from shmmap.errors import MapDataError, Offline, SegmentCorrupt, ShmmapError
+from shmmap.errors import MapDataError, Offline, Replaced, SegmentCorrupt, ShmmapError
 from shmmap.failpoints import step
+from shmmap.installed import RESTART
 from shmmap.layers.build import Made, make_layer
 from shmmap.layers.disk_cache import LayerCache
 from shmmap.layers.points import LAYER
@@ -194,6 +195,8 @@ class _Worker:
             self._fail(job, "over_budget", "it does not fit in the budget")
         except Offline as error:
             self._fail(job, error.code, error.message, unread=True)
+        except Replaced:
+            self._fail(job, "load_failed", f"{job.source.name}: {RESTART}")
         except ShmmapError as error:
             self._fail(job, "load_failed", str(error))
         except OSError as error:

@@ -23,6 +23,7 @@ import msgspec
 from shmmap.daemon.loading import worker_messages
 from shmmap.daemon.loading.prepared_parent import PreparedParent
 from shmmap.daemon.turns import WatchedDescriptors
+from shmmap.errors import Replaced
 from shmmap.layers.points import LAYER
 from shmmap.logfmt import log
 from shmmap.processes.start_child import channel, packet_buffer, receive_packet
@@ -218,12 +219,12 @@ class WorkerPool:
         return bool(self._workers) and count <= self.limit and all(w.layers for w in self)
 
     def start_one(self, *, for_points: bool = False) -> Worker:
-        """Start a worker process; raise OSError if that fails."""
+        """Start a worker process; raise OSError if that fails, Replaced if it would be of another version."""
         ours, theirs = channel()
         try:
             with theirs:
                 self.parent.fork(theirs)
-        except OSError:
+        except (OSError, Replaced):
             ours.close()
             raise
         ours.setblocking(False)
@@ -246,6 +247,8 @@ class WorkerPool:
         ------
         OSError
             The file for its segment cannot be created.
+        Replaced
+            There is no worker, and a new one would be of another version than this daemon.
         """
         computed = is_computed(job)
         worker, start = self._least_busy(computed=computed), self._may_start
@@ -254,6 +257,9 @@ class WorkerPool:
         if worker is None or (len(worker.queue) >= self.places and start):
             try:
                 worker = self.start_one(for_points=not start)
+            except Replaced:
+                if worker is None:
+                    raise
             except OSError as error:  # not enough processes, memory or descriptors at present
                 log.error("loader could not start", reason=error)
                 if worker is None:

@@ -35,7 +35,7 @@ from shmmap.protocol import messages
 from shmmap.protocol.codec import encode
 from shmmap.protocol.events import Recent
 from shmmap.protocol.rows import CellState
-from shmmap.version import __version__
+from shmmap.version import build_version
 
 __all__ = ["MapQueries"]
 
@@ -98,7 +98,7 @@ class MapQueries:
         cache, catalogue, (major, minor) = self.cache, self._catalogue, messages.PROTOCOL_VERSION
         ledger = cache.ledger
         return messages.Welcome(
-            message.request, major, minor, daemon=__version__, instance=self.config.instance,
+            message.request, major, minor, daemon=build_version(), instance=self.config.instance,
             epoch=self.cache.epoch, session=session.slot, map_version=catalogue.map_version,
             map_path=self.config.map_path, frame_id=catalogue.frame_id, shm_dir=self.config.shm_dir,
             id_prefix=cache.id_prefix, segment_prefix=cache.segment_prefix, cells=len(catalogue),

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import struct
 import threading
 from pathlib import Path
@@ -63,10 +64,13 @@ def test_a_daemon_of_1_x_is_named(shmmap: Verbs, short_path: Path) -> None:
     try:
         assert listens.wait(TIMEOUT_S)
         printed = [shmmap(*words, "--endpoint", str(path), code=76) for words in VERBS]
+        stop = shmmap("stop", "--endpoint", str(path), code=76)
     finally:
         context.term()
         daemon.join()
     assert {(tag, *version) for tag, version in asked} == {("hello", 2, 0)}
+    assert said in stop
+    assert f"a signal ends a daemon of any version: kill {os.getpid()}" in stop
     for text in printed:
         assert said in text
         assert "update the older of the two" in text

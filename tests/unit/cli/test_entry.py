@@ -15,6 +15,7 @@ import pytest
 from shmmap import errors
 from shmmap.cli.entry import main
 from shmmap.cli.verbs.run import about
+from shmmap.version import build_version
 from tests.unit.conftest import Verb
 
 EXIT_CODES = {
@@ -139,15 +140,13 @@ def test_closed_streams_are_no_defect() -> None:
 def test_version_and_its_json(verb: Verb, capsys: pytest.CaptureFixture[str]) -> None:
     import json
 
-    import shmmap
-
     document = json.loads(verb(["version", "--json"]).out)
-    assert document["shmmap"] == shmmap.__version__
+    assert document["shmmap"] == build_version()
     assert all(re.fullmatch(r"\d+\.\d+", document[name]) for name in ("protocol", "layout"))
     with pytest.raises(SystemExit) as ended:
         main(["--version"])
     assert ended.value.code == 0
-    assert capsys.readouterr().out == f"shmmap {shmmap.__version__}\n"
+    assert capsys.readouterr().out == f"shmmap {build_version()}\n"
 
 
 @pytest.mark.parametrize("name", ["status", "ls", "health"])

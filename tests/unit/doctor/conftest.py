@@ -9,11 +9,11 @@ from typing import Any, cast
 
 import pytest
 
-import shmmap
 from shmmap.daemon.config import DaemonConfig
 from shmmap.doctor.diagnosis import Diagnosis, Machine
 from shmmap.statistics.identity import DaemonIdentity
 from shmmap.statistics.reader import Snapshot
+from shmmap.version import build_version
 
 USER = 61005
 IDENTITY = DaemonIdentity(
@@ -27,7 +27,7 @@ IDENTITY = DaemonIdentity(
     map_version=1,
     shm_dir="/dev/shm",
     id_prefix="",
-    library_version=shmmap.__version__,
+    library_version=build_version(),
     started_unix_ns=1,
     frame_id="map",
 )
@@ -42,7 +42,7 @@ class _Made(Snapshot):
         self.__dict__["counters"] = counters
 
 
-def snapshot(state: str = "healthy", *, version: str = shmmap.__version__, **counters: int) -> Snapshot:
+def snapshot(state: str = "healthy", *, version: str = build_version(), **counters: int) -> Snapshot:
     return _Made(state, version, counters)
 
 

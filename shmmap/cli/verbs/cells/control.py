@@ -4,13 +4,15 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 from typing import TYPE_CHECKING, Final
 
 from shmmap.cli.areas import act_on_cells, add_cells_argument
-from shmmap.cli.daemon_address import connect
+from shmmap.cli.daemon_address import connect, endpoint
 from shmmap.cli.options import Subparsers, add_daemon_options, add_layer_option, add_verb, layers_from
 from shmmap.cli.program import add_allow_empty
 from shmmap.cli.screens.output import Column, counted, format_bytes, print_json, print_line, print_table
+from shmmap.errors import ProtocolMismatch
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -145,6 +147,8 @@ def _kept(client: Client, cells: list[str] | None) -> list[str]:
     ]
 
 
+_CONNECT_S: Final = 1.0
+
 _STOP_EXIT = """\
 Exit code: 0, or 1 when this user may not do it."""
 
@@ -158,7 +162,8 @@ def add_stop(subparsers: Subparsers) -> None:
         help="end the daemon and free its memory",
         description="End the daemon, as SIGTERM does: a cell's memory is freed as soon as no "
         "process maps it.  The daemon's user, root and members of its --admin-group may do this; unlike "
-        "a signal it works for other users than the daemon's.",
+        "a signal it works for other users than the daemon's.  A daemon of another version of the protocol "
+        "refuses it: the error names the process to send a signal to.",
         output="cells.outputs.Stop",
         epilog=_STOP_EXIT,
     )
@@ -167,15 +172,36 @@ def add_stop(subparsers: Subparsers) -> None:
 
 def run_stop(args: argparse.Namespace) -> int:
     """Ask the daemon to stop."""
-    with connect(args) as client:
-        pid = client.welcome.pid
-        client.shutdown()
+    try:
+        with connect(args) as client:
+            pid = client.welcome.pid
+            client.shutdown()
+    except ProtocolMismatch as error:
+        raise ProtocolMismatch(
+            error.message, hint=f"a signal ends a daemon of any version: kill {_listener(args) or 'PID'}"
+        ) from None
     if args.json:
         from shmmap.cli.verbs.cells import outputs
 
         print_json(outputs.Stop(pid))
     else:
         print_line(f"daemon {pid} is stopping")
+    return 0
+
+
+def _listener(args: argparse.Namespace) -> int:
+    """Return the process that listens at the daemon's socket; 0 if it is a service manager, or unknown."""
+    import socket
+    import struct
+
+    from shmmap.client.discovery import candidates
+
+    for path in candidates(endpoint(args)):
+        with socket.socket(socket.AF_UNIX) as peer, contextlib.suppress(OSError):
+            peer.settimeout(_CONNECT_S)
+            peer.connect(path)
+            pid: int = struct.unpack("3i", peer.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))[0]
+            return pid if pid > 1 else 0
     return 0
 
 

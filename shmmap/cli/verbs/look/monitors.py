@@ -14,6 +14,7 @@ from shmmap.cli.options import Subparsers, add_statistics_options, add_verb
 from shmmap.cli.screens.output import counted, format_duration, print_hanging, print_json, print_line
 from shmmap.doctor.verdicts import trust_problems
 from shmmap.errors import DaemonUnreachable, NoSocket, ProtocolMismatch, ShmmapError
+from shmmap.installed import RESTART
 
 if TYPE_CHECKING:
     from shmmap.doctor.verdicts import Finding
@@ -24,10 +25,10 @@ __all__ = ["add_doctor", "add_health", "add_metrics", "run_doctor", "run_health"
 
 _HEALTH_EXIT = """\
 Exit code: 0 healthy, 1 starting, unreachable, paused or hung, 69 dead or never started; with --strict
-also 1, and `unhealthy`, while clients lack something: cells were refused in the last minute, cells that were
-asked for cannot be loaded (they are named if the daemon answers), the map's files are out of reach, the map
-could not be read again or has problems, its signature has expired, the version that its origin offers is
-refused, or a live map has a problem, a damaged file or a missing chunk."""
+also 1, and `unhealthy`, while clients lack something: shmmap was replaced under the daemon, cells were refused
+in the last minute, cells that were asked for cannot be loaded (they are named if the daemon answers), the
+map's files are out of reach, the map could not be read again or has problems, its signature has expired, the
+version that its origin offers is refused, or a live map has a problem, a damaged file or a missing chunk."""
 
 
 _NAMED = 3
@@ -100,6 +101,8 @@ def _troubles(found: Snapshot) -> list[str]:
         for row in found.live
         if row.damaged_count
     ]
+    if counts.get("package_replaced", 0):
+        troubles.append(f"{RESTART} (it keeps what is in memory)")
     if counts.get("origin_out", 0):
         troubles.append("no load succeeds: the map's files are out of reach (`shmmap doctor`)")
     troubles += trust_problems(counts, time.time())

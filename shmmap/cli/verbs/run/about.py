@@ -42,10 +42,10 @@ def _versions() -> Versions:
 
 
 def installed_version() -> str:
-    """Return the version of this package."""
-    import shmmap
+    """Return the version of this package, with the commit of a checkout."""
+    from shmmap.version import build_version
 
-    return shmmap.__version__
+    return build_version()
 
 
 def add_version(subparsers: Subparsers) -> None:

@@ -126,7 +126,10 @@ def run_install(args: argparse.Namespace) -> int:
     write(planned)
     if (args.user or args.root == "/") and os.path.isdir("/run/systemd/system"):
         _let_systemd_know(args.user, planned)
-    if args.user:
+    running = _running(args.user) if args.user or args.root == "/" else []
+    if running and not args.huge_pages:  # an upgrade: `enable --now` would do nothing
+        print_line(f"next: systemctl {'--user ' if args.user else ''}restart {' '.join(running)}")
+    elif args.user:
         print_line("next: systemctl --user enable --now shmmapd && loginctl enable-linger")
     elif args.root == "/":
         if args.huge_pages:
@@ -141,6 +144,18 @@ def run_install(args: argparse.Namespace) -> int:
             f"next: systemctl --root={args.root} enable shmmapd; account and directories are made at boot"
         )
     return 0
+
+
+def _running(user: bool) -> list[str]:
+    """Return the services of this package that run now; none without systemd."""
+    import subprocess
+
+    if not os.path.isdir("/run/systemd/system"):
+        return []
+    command = ["systemctl", *(["--user"] if user else []), "list-units", "--plain", "--no-legend"]
+    command += ["--state=active,activating", "shmmapd*.service", "shmmap-*.service"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    return sorted({line.split()[0].removesuffix(".service") for line in done.stdout.splitlines() if line})
 
 
 def _let_systemd_know(user: bool, planned: Sequence[PlannedFile]) -> None:
