@@ -278,6 +278,11 @@ def test_a_file_that_is_replaced_while_it_is_read_is_not_lost(damaged: Damaged) 
     served = damaged.serve()
     files, whole = served.live.files.files, damaged.path.read_bytes()
     read = files.read
-    files.read = lambda name, most=1 << 28: setattr(files, "read", read) or read(name, most)[:-1]  # type: ignore[method-assign, assignment, misc]
+
+    def once_cut(name: str, most: int = 1 << 28) -> bytes:
+        files.read = read  # type: ignore[method-assign]
+        return read(name, most)[:-1]
+
+    files.read = once_cut  # type: ignore[method-assign]
     assert damaged.answer(served, "all") == (set(), damaged.voxels)
     assert damaged.path.read_bytes() == whole
