@@ -19,7 +19,7 @@ from shmmap.chunks.voxels import ChunkKey, voxel_centers
 from shmmap.client.arguments import checked_seconds
 from shmmap.client.connection import until_served
 from shmmap.client.live.chunk_reader import ChunkInfo, ChunkReader, Place
-from shmmap.client.live.problems import with_problem
+from shmmap.client.live.problems import PROBLEM_S, with_problem
 from shmmap.client.session import Session
 from shmmap.errors import BadRequest, NoAnswer, SegmentCorrupt, SegmentError, StaleHandle
 from shmmap.lacking import warn_of_lost_chunks
@@ -130,10 +130,12 @@ class LiveMap:
                 lambda: self._session.ask(make, kind, quiet_s=quiet_s), self._session.timeout_s + quiet_s
             )
         except NoAnswer as error:
-            if kind is messages.LiveListed:
+            if not quiet_s:  # the daemon itself does not answer
                 raise
             raise with_problem(
-                error, self.name, lambda: self._session.ask(messages.LiveList, messages.LiveListed)
+                error,
+                self.name,
+                lambda: self._session.ask(messages.LiveList, messages.LiveListed, timeout_s=PROBLEM_S),
             ) from error
 
     @property

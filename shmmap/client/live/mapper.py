@@ -26,7 +26,7 @@ from shmmap.chunks.marks import encode_marks
 from shmmap.chunks.occupancy import ScanCounts, ScanFilter
 from shmmap.client.arguments import checked_seconds
 from shmmap.client.connection import SERVED_PAUSE_S, Connection, until_served
-from shmmap.client.live.problems import with_problem
+from shmmap.client.live.problems import PROBLEM_S, with_problem
 from shmmap.client.session import Session
 from shmmap.errors import (
     BadRequest,
@@ -48,8 +48,6 @@ PASSING: Final = (LiveInterrupted, Busy, DaemonUnreachable)
 """Temporary errors: sending is retried."""
 MAX_UNANSWERED: Final = 3
 """Most scans without an answer; `LiveMapper.add` waits while there are this many."""
-PROBLEM_S: Final = 1.0
-"""Time for the daemon to say why it has not answered."""
 LAST_S: Final = 1.0
 """Time for unanswered scans at the end of a program that has not closed the mapper."""
 

@@ -4,11 +4,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Final
 
 from shmmap.errors import NoAnswer, ShmmapError
 from shmmap.protocol.live import LiveListed
 
-__all__ = ["with_problem"]
+__all__ = ["PROBLEM_S", "with_problem"]
+
+PROBLEM_S: Final = 1.0
+"""Time for the daemon to say why it has not answered."""
 
 
 def with_problem(error: NoAnswer, name: str, ask: Callable[[], LiveListed]) -> NoAnswer:

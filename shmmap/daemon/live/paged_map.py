@@ -470,7 +470,8 @@ class PagedMap:
             return  # saved meanwhile
         self.stored.discard(key)
         chunk = self.residency.chunks.get(key)
-        if key in self.chunks and chunk is not None and self.files.note_whole(key, chunk.version):
+        if key in self.chunks and chunk is not None and chunk.saved:  # else it was made new meanwhile
+            self.files.note_whole(key, chunk.version)
             self.residency.save_again(chunk, now_s)
 
     def _save(self, key: ChunkKey, view: ChunkView) -> None:

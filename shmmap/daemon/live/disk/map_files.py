@@ -58,6 +58,7 @@ from shmmap.logfmt import log
 
 __all__ = ["MapFiles", "loss_text"]
 
+_LOOKED_AT: Final = 16
 _UNKNOWN: Final = Row(0, 0, 0, 0, 0, 0)
 SCANS_AHEAD: Final = 1 << 20
 """Scan numbers that ``map.json`` reserves for a mapper at a time: those of a day at 10 Hz."""
@@ -118,9 +119,9 @@ class MapFiles:
         if MAP_FILE in names.everything:
             with _named(MAP_FILE):
                 self._map = self._read_map(settings)
-        elif names.chunks or names.strange:
+        elif names.chunks or names.strange or MANIFEST in names.everything:
             raise MapDataError(
-                "there are chunks, but the file that says what they are is missing",
+                "there are chunks, or a list of them, but the file that says what they are is missing",
                 path=MAP_FILE,
                 hint="choose another directory, or bring the file back",
             )
@@ -255,8 +256,8 @@ class MapFiles:
         return decode_chunk(data, self.settings.identity(self.map_id, key, generation), key.text)
 
     def look_again(self) -> None:
-        """Try to read chunks that were unreadable."""
-        for key in list(self.unreadable):
+        """Try to read some of the chunks that were unreadable."""
+        for key in list(self.unreadable)[:_LOOKED_AT]:
             with contextlib.suppress(OSError):
                 self.load(key)
 
@@ -283,15 +284,13 @@ class MapFiles:
         if key in self.missing:
             self._remade.add(key)
 
-    def note_whole(self, key: ChunkKey, version: int) -> bool:
-        """Return whether a chunk in memory, of this version, has all that is lost on disk; note that."""
+    def note_whole(self, key: ChunkKey, version: int) -> None:
+        """Note that a chunk is in memory as it was saved, or newer; it is missing no more if it is whole."""
         row = self.missing.get(key)
-        if row is None or key in self._remade or version < row.version:
-            return False
-        del self.missing[key]
-        self.manifest_is_due = True
-        log.info("chunk is whole in memory, and saved again", chunk=key.text)
-        return True
+        if row is not None and key not in self._remade and version >= row.version:
+            del self.missing[key]
+            self.manifest_is_due = True
+            log.info("chunk is whole in memory, and saved again", chunk=key.text)
 
     def losses(self, most: int) -> tuple[tuple[str, ...], int]:
         """Return texts about quarantined files and other chunks that lost something; and their number."""

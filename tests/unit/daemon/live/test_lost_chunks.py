@@ -18,7 +18,7 @@ from shmmap.daemon.live.disk.stored_map import StoredMap
 from shmmap.errors import MapDataError
 from shmmap.protocol.live import LiveChunks, LiveVoxels, LiveVoxelsReply
 from shmmap.protocol.messages import ErrorReply
-from tests.support.live_drive import RESOLUTION, Voxel
+from tests.support.live_drive import RESOLUTION, Voxel, marked
 from tests.support.live_reference import stored_drive
 from tests.support.served_map import Served
 
@@ -218,6 +218,29 @@ def test_what_memory_has_is_saved_again(damaged: Damaged, name: str, dies: bool)
     assert checked.manifest == "current"
 
 
+def test_a_chunk_that_is_lost_twice(damaged: Damaged) -> None:
+    """What was mapped since the first loss is in memory and saved again; the first loss stays named."""
+    served = damaged.serve()
+    damaged.damage("gone")
+    mapper = served.open().mapper
+    place = tuple((index + 0.5) * 64 * RESOLUTION for index in damaged.key)
+    served.live.move("client", place)  # type: ignore[arg-type]
+    served.until(lambda: damaged.key in served.live.chunks)
+    (marks,) = (one for one in marked(3)[2:])
+    assert damaged.key in marks.chunks
+    served.answer(served.send(marks, mapper, 1, at=place[0]))
+    served.until(lambda: served.map.is_saved, save_all=True)
+    mapped = damaged.answer(served, "all")
+    assert mapped[0] == {damaged.key}
+    damaged.damage("a bit of the body")
+    assert damaged.answer(served, "disk")[0] == {damaged.key}
+    served.until(lambda: served.map.is_saved, save_all=True)
+    assert damaged.answer(served, "disk") == damaged.answer(served, "all") == mapped
+    served.end()
+    served = damaged.serve()
+    assert damaged.answer(served, "disk") == mapped
+
+
 def test_a_file_that_is_put_back_is_lost_no_more(damaged: Damaged) -> None:
     whole = damaged.path.read_bytes()
     damaged.damage("gone")
@@ -255,6 +278,11 @@ def test_a_file_that_is_replaced_while_it_is_read_is_not_lost(damaged: Damaged) 
     served = damaged.serve()
     files, whole = served.live.files.files, damaged.path.read_bytes()
     read = files.read
-    files.read = lambda name, most=1 << 28: setattr(files, "read", read) or read(name, most)[:-1]  # type: ignore[method-assign, assignment, misc]
+
+    def once_cut(name: str, most: int = 1 << 28) -> bytes:
+        files.read = read  # type: ignore[method-assign]
+        return read(name, most)[:-1]
+
+    files.read = once_cut  # type: ignore[method-assign]
     assert damaged.answer(served, "all") == (set(), damaged.voxels)
     assert damaged.path.read_bytes() == whole

@@ -84,12 +84,13 @@ def test_other_settings_are_refused(other: MapSettings, key: str) -> None:
     assert caught.value.key == key
 
 
-def test_chunks_without_a_map_are_left_alone() -> None:
+@pytest.mark.parametrize("name", ["0_0_0.chunk", "manifest.json"])
+def test_chunks_without_a_map_are_left_alone(name: str) -> None:
     disk = CutDisk()
-    disk.write("0_0_0.chunk", b"whatever")
+    disk.write(name, b"whatever")
     with pytest.raises(MapDataError, match="missing"):
         MapFiles(disk, SETTINGS)
-    assert disk.names() == ["0_0_0.chunk"]
+    assert disk.names() == [name]
 
 
 def test_a_damaged_file_is_quarantined_and_never_overwritten(tmp_path: Path) -> None:
