@@ -59,7 +59,7 @@ def _noise(columns: Columns) -> NDArray[np.bool_]:
 
 def las_left_out(columns: Columns, *, drop_noise: bool) -> NDArray[np.bool_]:
     """Return (N,) which points are left out: those flagged withheld, and with ``drop_noise`` noise."""
-    mask = columns["withheld"] != 0
+    mask: NDArray[np.bool_] = columns["withheld"] != 0
     return mask | _noise(columns) if drop_noise else mask
 
 

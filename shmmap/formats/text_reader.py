@@ -50,6 +50,7 @@ _UNNAMED: Final = {1: ("intensity",), 3: _COLOURS, 4: ("intensity", *_COLOURS)}
 _NORMAL_LENGTHS: Final = (0.99, 1.01)
 _LOOKED_AT: Final = 1024  # rows to look at
 _LOOKED_AT_NORMALS: Final = 32
+_LARGE: Final = 1e100  # no coordinate; its square could not be computed
 _SHOWN: Final = 60
 
 
@@ -322,12 +323,14 @@ class _Lines:
         layout.warnings = tuple(warnings)
 
     def _first_rows(self, layout: _Layout) -> NDArray[np.float64]:
-        """Return the first rows, (N, columns), as far as they are whole and numbers."""
+        """Return the first rows, (N, columns), as far as they are whole and finite numbers."""
         count, rows = len(layout.names), []
         for line in self.head[layout.data_at :].split(b"\n")[: None if self.whole else -1][:_LOOKED_AT]:
             words = line.replace(layout.separator or b" ", b" ").split()
             if len(words) == count and all(map(NUMBER.match, words)):
-                rows.append([float(word) for word in words])
+                values = [float(word) for word in words]
+                if all(abs(value) < _LARGE for value in values):
+                    rows.append(values)
         return np.array(rows, np.float64).reshape(-1, count)
 
     def _are_colours(self, values: NDArray[np.float64]) -> bool:

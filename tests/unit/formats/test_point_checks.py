@@ -72,6 +72,7 @@ def test_withheld_points_are_left_out_and_noise_on_request(
         tmp_path / "map",
         DivideSettings(durable=False, force=True, drop_noise=True, fields=("x", "y", "z")),
     )
+    assert made.bounds is not None
     assert (made.dropped, made.points, made.bounds[1][2]) == (31, POINTS - 31, 0.0)
     assert any("11 points left out: classified as noise" in note for note in made.notes)
 
@@ -179,7 +180,7 @@ def test_rounded_text_is_named(tmp_path: Path) -> None:
 
 
 def rows(*columns: object) -> str:
-    return "".join(" ".join(map(str, row)) + "\n" for row in zip(*columns, strict=True))  # type: ignore[call-overload]
+    return "".join(" ".join(map(str, row)) + "\n" for row in zip(*columns, strict=True))
 
 
 N = 20

@@ -171,6 +171,7 @@ def test_stated_units_are_refused_with_the_factor_and_converted(tmp_path: Path, 
     assert isinstance(origin, DividedCloud)
     for unit, factor in (("auto", 0.001), ("mm", 0.001), ("m", 1.0), ("cm", 0.01)):
         made = divide([path], out, DivideSettings(durable=False, unit=unit, force=True))
+        assert made.bounds is not None
         np.testing.assert_allclose(made.bounds[1], np.array([4000, 5000, 6000]) * factor)
         about_units = [note for note in made.notes if "metres" in note]
         assert len(about_units) == 1, made.notes
@@ -214,6 +215,7 @@ def test_units_that_do_not_go_together(tmp_path: Path) -> None:
         with pytest.raises(MapDataError, match="z in a unit that the header does not state"):
             divide([path], tmp_path / "map", DivideSettings(durable=False, unit=unit))
     made = divide([path], tmp_path / "map", DivideSettings(durable=False, unit="auto", vertical_unit="m"))
+    assert made.bounds is not None
     np.testing.assert_allclose(made.bounds[1], [4, 5, 6000])
 
 
