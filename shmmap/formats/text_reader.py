@@ -282,7 +282,8 @@ class _Lines:
                     continue
                 if found.problem:
                     raise self._error("not_metres", found.problem, named_at)
-                layout.names = [_bare(word) for word in words]
+                bare = [word.strip().strip("\"'").strip() for word in words]
+                layout.names = [f"{name}_2" if name in AXES else name for name in bare]
                 for axis, place in zip(AXES, found.places, strict=True):
                     layout.names[place] = axis
                 layout.crs, layout.warnings = found.crs, found.notes
@@ -366,10 +367,6 @@ def _splits(text: str, separator: str, count: int) -> Iterator[list[str]]:
 def _units(text: str, separator: str, count: int) -> list[LengthUnit | None] | None:
     """Return the units of ``count`` columns if a line has nothing but units."""
     return next(filter(None, map(units_row, _splits(text, separator, count))), None)
-
-
-def _bare(word: str) -> str:
-    return word.strip().strip("\"'").strip()
 
 
 def _shown(line: bytes) -> str:

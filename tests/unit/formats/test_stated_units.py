@@ -103,6 +103,8 @@ def test_names_of_coordinates(names: str, places: tuple[int, int, int] | None) -
         ("all coordinates are given in centimeters", 0.01, 0.01),
         ("x, y and z in feet", FT, FT),
         ("xyz [mm]", 0.001, 0.001),
+        ("made by a tool, units in cm", 0.01, 0.01),
+        ("made by a tool. Units: ft. 1000 points.", FT, FT),
         ("Vertical units: ft", None, FT),
         ("horizontal unit: us-ft", US_FT, None),
         ("angle units: deg", None, None),
@@ -237,6 +239,12 @@ def test_columns_of_a_named_table_are_found_and_kept(tmp_path: Path) -> None:
     assert list(cloud.columns) == ["xyz", "intensity", "laser_id"]
     path.write_text("Northing,Easting,Elevation\n20.5,10.5,30.5\n")
     assert read_cloud(path).xyz.tolist() == [[10.5, 20.5, 30.5]]
+    path.write_text("x,Points:0,Points:1,Points:2,X\n1,2,3,4,5\n")
+    assert {name: values[0].tolist() for name, values in read_cloud(path).columns.items()} == {
+        "xyz": [2, 3, 4],
+        "x_2": 1,
+        "X": 5,
+    }
     path.write_text("intensity,laser_id,azimuth,range\n1,2,3,4\n")
     with pytest.raises(MapDataError) as caught:
         read_cloud(path)
