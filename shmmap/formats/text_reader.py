@@ -306,14 +306,9 @@ class _Lines:
         elif names_of_others[-3:] == _COLOURS and not self._are_colours(rows[:, -3:]):
             names_of_others = ()
             warnings.append(f"columns {count - 2} to {count} are no colours, which are integers of 0 to 255")
-            if len(rows) > 1 and _are_bytes(rows[:, :3]):
-                raise self._error(
-                    "bad_row",
-                    "columns 1 to 3 look like a colour (integers of 0 to 255), the last three do not",
-                    layout.data_at,
-                    hint=f"no header says which columns are coordinates: {NAME_THEM}",
-                )
-        if others and len(rows) > 2 and (np.diff(rows[:, 0]) == 1).all() and (rows[:, 0] % 1 == 0).all():
+        if len(rows) > 1 and not (names_of_others and self.suffix in (".xyzn", ".xyzrgb")):
+            self._check_first(rows, layout.data_at)
+        if others and len(rows) > 2 and (np.diff(rows[:, 0]) > 0).all() and (rows[:, 0] % 1 == 0).all():
             warnings.append(f"the first column counts the rows: if it is no coordinate, {NAME_THEM}")
         if not names_of_others:
             names_of_others = [f"column_{place}" for place in range(4, count + 1)]
@@ -322,6 +317,20 @@ class _Lines:
             taken = ", ".join(names_of_others)
             warnings.insert(0, f"no header names the columns: after x, y and z they are taken as {taken}")
         layout.warnings = tuple(warnings)
+
+    def _check_first(self, rows: NDArray[np.float64], data_at: int) -> None:
+        """Refuse a colour in front: three columns of bytes before three or more that are no integers."""
+        if (
+            _are_bytes(rows[:, :3])
+            and not _are_normals(rows)
+            and np.count_nonzero((rows[:, 3:] % 1 != 0).any(axis=0)) >= 3
+        ):
+            raise self._error(
+                "bad_row",
+                "columns 1 to 3 look like a colour (integers of 0 to 255), other columns like coordinates",
+                data_at,
+                hint=f"no header says which columns are coordinates: {NAME_THEM}",
+            )
 
     def _first_rows(self, layout: _Layout) -> NDArray[np.float64]:
         """Return the first rows, (N, columns), as far as they are whole and finite numbers."""
