@@ -352,7 +352,8 @@ class _Run:
     def _steps(self, extremes: NDArray[np.float64]) -> list[str]:
         """Return a note if the inputs' coordinates are float32, and too large for it."""
         single = [source for source in self._sources if source.row["x"].itemsize == 4]
-        note = step_warning(*(extremes + self._frame.origin), np.dtype(np.float32)) if single else ""
+        low, high = extremes + self._frame.origin
+        note = step_warning(low, high, np.dtype(np.float32)) if single else ""
         where = single[0].path if len(single) == 1 else f"{len(single)} inputs"
         return [f"{where}: {note}"] if note else []
 

@@ -94,14 +94,15 @@ class Frame:
             )
 
 
-def _source_bounds(sources: Sequence[Source]) -> Bound3:
+def _source_bounds(sources: Sequence[Source], *, believe: bool = True) -> Bound3:
     """Return the bounds of all finite points, from the headers if possible, else by reading the sources.
 
-    NaN if there is no finite point.
+    NaN if there is no finite point.  Without ``believe`` headers are not used: their bounds include points
+    that are left out.
     """
     bounds = Bounds()
     for source in sources:
-        if source.claimed_bounds is not None:
+        if believe and source.claimed_bounds is not None:
             if source.points:
                 plane, height = source.scale
                 bounds.add(np.array(source.claimed_bounds, np.float64) * (plane, plane, height))
@@ -134,7 +135,12 @@ def choose_frame(
     """
     if row["x"].itemsize == 4 and not isinstance(translation, tuple):
         return Frame(NO_MOVE, np.dtype(np.float32))
-    return frame_between(_source_bounds(sources), row["x"], lattice, translation, before)
+    frame = frame_between(_source_bounds(sources), row["x"], lattice, translation, before)
+    claimed = any(source.claimed_bounds is not None for source in sources)
+    if claimed and translation == "auto" and frame.axis.itemsize == 8:
+        bounds = _source_bounds(sources, believe=False)
+        frame = frame_between(bounds, row["x"], lattice, translation, before)
+    return frame
 
 
 def frame_between(

@@ -59,7 +59,7 @@ def _noise(columns: Columns) -> NDArray[np.bool_]:
 
 def las_left_out(columns: Columns, *, drop_noise: bool) -> NDArray[np.bool_]:
     """Return (N,) which points are left out: those flagged withheld, and with ``drop_noise`` noise."""
-    mask = columns["withheld"] != 0
+    mask: NDArray[np.bool_] = columns["withheld"] != 0
     return mask | _noise(columns) if drop_noise else mask
 
 
@@ -165,6 +165,6 @@ def step_warning(
         return ""
     step = np.format_float_positional(float(np.spacing(np.float32(reach))), trim="-")
     return (
-        f"x, y and z are float32, so at coordinates up to {reach:.0f} they are multiples of {step}:"
-        " what is finer was lost before; write them as float64, or nearer to the origin"
+        f"x, y and z are float32 and so far from zero that they are multiples of {step}: what is finer was"
+        " lost before; write them as float64, or nearer to zero"
     )

@@ -8,6 +8,7 @@ What looks like a unit and is none is reported, not guessed at.
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -262,15 +263,14 @@ def units_in_comments(comments: Iterable[str]) -> tuple[LengthUnit | None, Lengt
     Comments that contradict each other give a unit of unknown length.
     """
     stated: tuple[list[LengthUnit], list[LengthUnit]] = ([], [])
-    for text in comments:
-        for pattern in _STATED:
-            found = pattern.match(text.lower())
-            if found and (unit := _first_unit(found["unit"])):
-                if "vertical" not in found["what"]:
-                    stated[0].append(unit)
-                if "horizontal" not in found["what"]:
-                    stated[1].append(unit)
-                break
+    clauses = (clause for text in comments for clause in dict.fromkeys((text, *re.split(r"[,;.]\s", text))))
+    for clause, pattern in itertools.product(clauses, _STATED):
+        found = pattern.match(clause.lower())
+        if found and (unit := _first_unit(found["unit"])):
+            if "vertical" not in found["what"]:
+                stated[0].append(unit)
+            if "horizontal" not in found["what"]:
+                stated[1].append(unit)
     return _only(stated[0]), _only(stated[1])
 
 

@@ -50,6 +50,7 @@ _UNNAMED: Final = {1: ("intensity",), 3: _COLOURS, 4: ("intensity", *_COLOURS)}
 _NORMAL_LENGTHS: Final = (0.99, 1.01)
 _LOOKED_AT: Final = 1024  # rows to look at
 _LOOKED_AT_NORMALS: Final = 32
+_LARGE: Final = 1e100  # no coordinate; its square could not be computed
 _SHOWN: Final = 60
 
 
@@ -281,7 +282,8 @@ class _Lines:
                     continue
                 if found.problem:
                     raise self._error("not_metres", found.problem, named_at)
-                layout.names = [_bare(word) for word in words]
+                bare = [word.strip().strip("\"'").strip() for word in words]
+                layout.names = [f"{name}_2" if name in AXES else name for name in bare]
                 for axis, place in zip(AXES, found.places, strict=True):
                     layout.names[place] = axis
                 layout.crs, layout.warnings = found.crs, found.notes
@@ -304,14 +306,9 @@ class _Lines:
         elif names_of_others[-3:] == _COLOURS and not self._are_colours(rows[:, -3:]):
             names_of_others = ()
             warnings.append(f"columns {count - 2} to {count} are no colours, which are integers of 0 to 255")
-            if len(rows) > 1 and _are_bytes(rows[:, :3]):
-                raise self._error(
-                    "bad_row",
-                    "columns 1 to 3 look like a colour (integers of 0 to 255), the last three do not",
-                    layout.data_at,
-                    hint=f"no header says which columns are coordinates: {NAME_THEM}",
-                )
-        if others and len(rows) > 2 and (np.diff(rows[:, 0]) == 1).all() and (rows[:, 0] % 1 == 0).all():
+        if len(rows) > 1 and not (names_of_others and self.suffix in (".xyzn", ".xyzrgb")):
+            self._check_first(rows, layout.data_at)
+        if others and len(rows) > 2 and (np.diff(rows[:, 0]) > 0).all() and (rows[:, 0] % 1 == 0).all():
             warnings.append(f"the first column counts the rows: if it is no coordinate, {NAME_THEM}")
         if not names_of_others:
             names_of_others = [f"column_{place}" for place in range(4, count + 1)]
@@ -321,13 +318,29 @@ class _Lines:
             warnings.insert(0, f"no header names the columns: after x, y and z they are taken as {taken}")
         layout.warnings = tuple(warnings)
 
+    def _check_first(self, rows: NDArray[np.float64], data_at: int) -> None:
+        """Refuse a colour in front: three columns of bytes before three or more that are no integers."""
+        if (
+            _are_bytes(rows[:, :3])
+            and not _are_normals(rows)
+            and np.count_nonzero((rows[:, 3:] % 1 != 0).any(axis=0)) >= 3
+        ):
+            raise self._error(
+                "bad_row",
+                "columns 1 to 3 look like a colour (integers of 0 to 255), other columns like coordinates",
+                data_at,
+                hint=f"no header says which columns are coordinates: {NAME_THEM}",
+            )
+
     def _first_rows(self, layout: _Layout) -> NDArray[np.float64]:
-        """Return the first rows, (N, columns), as far as they are whole and numbers."""
+        """Return the first rows, (N, columns), as far as they are whole and finite numbers."""
         count, rows = len(layout.names), []
         for line in self.head[layout.data_at :].split(b"\n")[: None if self.whole else -1][:_LOOKED_AT]:
             words = line.replace(layout.separator or b" ", b" ").split()
             if len(words) == count and all(map(NUMBER.match, words)):
-                rows.append([float(word) for word in words])
+                values = [float(word) for word in words]
+                if all(abs(value) < _LARGE for value in values):
+                    rows.append(values)
         return np.array(rows, np.float64).reshape(-1, count)
 
     def _are_colours(self, values: NDArray[np.float64]) -> bool:
@@ -363,10 +376,6 @@ def _splits(text: str, separator: str, count: int) -> Iterator[list[str]]:
 def _units(text: str, separator: str, count: int) -> list[LengthUnit | None] | None:
     """Return the units of ``count`` columns if a line has nothing but units."""
     return next(filter(None, map(units_row, _splits(text, separator, count))), None)
-
-
-def _bare(word: str) -> str:
-    return word.strip().strip("\"'").strip()
 
 
 def _shown(line: bytes) -> str:

@@ -17,6 +17,7 @@ from shmmap.errors import MapDataError, MapMissing
 from shmmap.formats.cloud import cloud_suffix
 from shmmap.formats.coordinate_system import degrees_warning, unit_warnings
 from shmmap.formats.pcd.reader import PcdReader
+from shmmap.formats.point_checks import step_warning
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.catalogue_bytes import (
     Source,
@@ -318,7 +319,8 @@ def load_single_pcd(path: str) -> Catalogue:
     if not np.isfinite(lower).all():
         raise MapDataError("no finite point, so the map has no extent", path=path, cause="no_points")
     box = (float(lower[0]), float(lower[1]), float(upper[0]), float(upper[1]))
-    problems = [f"{path}: {warning}"] if (warning := degrees_warning(lower, upper)) else []
+    warnings = (degrees_warning(lower, upper), step_warning(lower, upper, reader.columns[0].dtype))
+    problems = [f"{path}: {warning}" for warning in warnings if warning]
     return Catalogue.from_cells([(path, box, SourceStamp.of(status))], problems=problems)
 
 

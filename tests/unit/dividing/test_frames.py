@@ -36,6 +36,7 @@ def test_large_float64_coordinates_are_moved(tmp_path: Path, encoding: str) -> N
     assert all(value % 20 == 0 for value in origin[:2])
     assert origin[2] == 0
     assert "moved by" in made.notes[0]
+    assert "float32 would have lost up to 250 mm where" in made.notes[0]
     report = read_report(tmp_path / "map")
     assert report is not None
     assert tuple(report["origin"]) == made.origin

@@ -180,7 +180,7 @@ def test_feet_are_refused_with_the_factor_and_converted(tmp_path: Path, suffix: 
         assert np.array(values) + made.origin == pytest.approx(np.array(expected) * US_FT, abs=1e-4)
     assert made.unit_m == (US_FT, US_FT)
     assert made.crs == ("EPSG:2277" if where == "keys" else "NAD83 / Texas Central (ftUS) (EPSG:2277)")
-    assert any("converted to metres" in note for note in made.notes)
+    assert made.notes == ["converted to metres: x, y and z are in US survey feet (0.304800609601 m)"]
     frame = read_map_frame(tmp_path / "map")
     assert frame == MapFrame(made.origin, made.crs, (US_FT, US_FT))
     assert open_map(tmp_path / "map", cache_dir=tmp_path / "cache").load().frame == frame

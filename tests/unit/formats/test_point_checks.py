@@ -72,6 +72,7 @@ def test_withheld_points_are_left_out_and_noise_on_request(
         tmp_path / "map",
         DivideSettings(durable=False, force=True, drop_noise=True, fields=("x", "y", "z")),
     )
+    assert made.bounds is not None
     assert (made.dropped, made.points, made.bounds[1][2]) == (31, POINTS - 31, 0.0)
     assert any("11 points left out: classified as noise" in note for note in made.notes)
 
@@ -95,6 +96,21 @@ def test_the_command_line_counts_alike(tmp_path: Path, capsys: pytest.CaptureFix
     assert "1,000, 20 left out" in capsys.readouterr().out
     assert main(["divide", str(path), str(tmp_path / "map"), "--drop-noise", "--quiet"]) == 0
     assert "969 of 1,000 read, 31 left out" in capsys.readouterr().out
+
+
+def test_points_left_out_do_not_choose_the_frame(tmp_path: Path) -> None:
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.scales = np.full(3, 0.01)
+    las = laspy.LasData(header)
+    x = 690_000 + np.arange(POINTS) * 0.1
+    x[:3] = 0.0
+    las.x, las.y, las.z = x, x + 4_640_000, x * 0
+    las.y[:3] = 0.0
+    las.withheld = np.arange(POINTS) < 3
+    las.write(str(tmp_path / "a.las"))
+    made = divide([tmp_path / "a.las"], tmp_path / "map", SETTINGS)
+    assert (dict(made.fields)["x"], made.points) == ("<f4", POINTS - 3)
+    assert made.origin[0] == pytest.approx(690_050, abs=50)
 
 
 def test_all_points_withheld(tmp_path: Path) -> None:
@@ -179,7 +195,7 @@ def test_rounded_text_is_named(tmp_path: Path) -> None:
 
 
 def rows(*columns: object) -> str:
-    return "".join(" ".join(map(str, row)) + "\n" for row in zip(*columns, strict=True))  # type: ignore[call-overload]
+    return "".join(" ".join(map(str, row)) + "\n" for row in zip(*columns, strict=True))
 
 
 N = 20
@@ -191,6 +207,8 @@ def test_a_colour_in_front_is_refused_with_the_remedy(tmp_path: Path) -> None:
     path = tmp_path / "a.txt"
     for text in (
         rows(*RGB, *XYZ),
+        rows(*RGB, [7] * N, *XYZ),
+        rows(*RGB, *XYZ, [7] * N, [8] * N),
         rows([10] * N, [20] * N, [30] * N, *XYZ),
         rows(*RGB, *XYZ).replace(" ", ";"),
     ):
@@ -216,6 +234,18 @@ def test_what_is_no_colour_is_not_called_one(tmp_path: Path, colour: list[float]
     assert list(read_cloud(tmp_path / "a.xyzrgb").columns) == ["xyz", "red", "green", "blue"]
 
 
+def test_a_lattice_with_normals_or_named_colours_is_no_colour(tmp_path: Path) -> None:
+    cube = [[value % base for value in range(N)] for base in (3, 5, 7)]
+    normal = [[0.6] * N, [0.0] * N, [0.8] * N]
+    for name, columns in (
+        ("a.txt", normal),
+        ("a.xyzn", normal),
+        ("a.xyzrgb", [[0.1] * N, [0.2] * N, [0.3] * N]),
+    ):
+        (tmp_path / name).write_text(rows(*cube, *columns))
+        assert read_cloud(tmp_path / name).xyz[:, 1].tolist() == cube[1]
+
+
 def test_row_numbers_and_flat_coordinates_are_named(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     for first in (0, 1, 1000):
@@ -223,6 +253,8 @@ def test_row_numbers_and_flat_coordinates_are_named(tmp_path: Path) -> None:
         made = divide([path], tmp_path / "map", SETTINGS)
         for said in (read_cloud(path).warnings, describe(path).warnings, made.notes):
             assert "the first column counts the rows" in " ".join(said)
+    path.write_text(rows([2, *range(7, 6 + N)], *XYZ))  # rows were filtered
+    assert "the first column counts the rows" in " ".join(read_cloud(path).warnings)
     path.write_text(rows([4.5] * N, *XYZ).replace(" ", ","))
     made = divide([path], tmp_path / "map", SETTINGS)
     for said in (read_cloud(path).warnings, describe(path).warnings, made.notes):

@@ -103,6 +103,8 @@ def test_names_of_coordinates(names: str, places: tuple[int, int, int] | None) -
         ("all coordinates are given in centimeters", 0.01, 0.01),
         ("x, y and z in feet", FT, FT),
         ("xyz [mm]", 0.001, 0.001),
+        ("made by a tool, units in cm", 0.01, 0.01),
+        ("made by a tool. Units: ft. 1000 points.", FT, FT),
         ("Vertical units: ft", None, FT),
         ("horizontal unit: us-ft", US_FT, None),
         ("angle units: deg", None, None),
@@ -171,6 +173,7 @@ def test_stated_units_are_refused_with_the_factor_and_converted(tmp_path: Path, 
     assert isinstance(origin, DividedCloud)
     for unit, factor in (("auto", 0.001), ("mm", 0.001), ("m", 1.0), ("cm", 0.01)):
         made = divide([path], out, DivideSettings(durable=False, unit=unit, force=True))
+        assert made.bounds is not None
         np.testing.assert_allclose(made.bounds[1], np.array([4000, 5000, 6000]) * factor)
         about_units = [note for note in made.notes if "metres" in note]
         assert len(about_units) == 1, made.notes
@@ -214,6 +217,7 @@ def test_units_that_do_not_go_together(tmp_path: Path) -> None:
         with pytest.raises(MapDataError, match="z in a unit that the header does not state"):
             divide([path], tmp_path / "map", DivideSettings(durable=False, unit=unit))
     made = divide([path], tmp_path / "map", DivideSettings(durable=False, unit="auto", vertical_unit="m"))
+    assert made.bounds is not None
     np.testing.assert_allclose(made.bounds[1], [4, 5, 6000])
 
 
@@ -235,6 +239,12 @@ def test_columns_of_a_named_table_are_found_and_kept(tmp_path: Path) -> None:
     assert list(cloud.columns) == ["xyz", "intensity", "laser_id"]
     path.write_text("Northing,Easting,Elevation\n20.5,10.5,30.5\n")
     assert read_cloud(path).xyz.tolist() == [[10.5, 20.5, 30.5]]
+    path.write_text("x,Points:0,Points:1,Points:2,X\n1,2,3,4,5\n")
+    assert {name: values[0].tolist() for name, values in read_cloud(path).columns.items()} == {
+        "xyz": [2, 3, 4],
+        "x_2": 1,
+        "X": 5,
+    }
     path.write_text("intensity,laser_id,azimuth,range\n1,2,3,4\n")
     with pytest.raises(MapDataError) as caught:
         read_cloud(path)

@@ -86,13 +86,8 @@ def run(args: argparse.Namespace) -> int:
         print_table(
             (Column("FIELD"), Column("DTYPE"), Column("COUNT", "right"), Column("UNIT")),
             [
-                [
-                    _field_name(spec.name),
-                    spec.dtype.str,
-                    str(spec.components),
-                    spec.unit if spec.name != "xyz" or _in_metres(found.crs) else "",
-                ]
-                for spec in found.columns
+                [_field_name(field.name), field.dtype, str(field.count), field.unit]
+                for field in outputs.CloudFile.of(found).fields
             ],
         )
     if outputs.Bounds.of(found) is None:
@@ -296,11 +291,6 @@ def _crs_lines(crs: CoordinateSystem | None) -> list[tuple[str, str]]:
     return [*([("crs", crs.label)] if crs.label else []), ("units", said + unsaid)]
 
 
-def _in_metres(crs: CoordinateSystem | None) -> bool:
-    """Whether coordinates are in metres, or the file does not say."""
-    return crs is None or not (crs.geographic or any(unit.metres != 1.0 for unit in crs.units))
-
-
 def _bounds_lines(bounds: outputs.Bounds | None, metric: bool = True) -> list[tuple[str, str]]:
     if bounds is None:
         return [("bounds", "none: no finite point")]
@@ -313,6 +303,7 @@ def _bounds_lines(bounds: outputs.Bounds | None, metric: bool = True) -> list[tu
 
 def _lines(found: CloudDescription) -> list[tuple[str, str]]:
     from shmmap.cli.verbs.cells import outputs
+    from shmmap.formats.coordinate_system import unit_warnings
 
     kind = " ".join(part for part in (found.format.upper(), found.version, found.encoding) if part)
     lines = [
@@ -321,7 +312,7 @@ def _lines(found: CloudDescription) -> list[tuple[str, str]]:
     ]
     if found.height > 1:
         lines.append(("organised", f"{found.width} x {found.height}"))
-    lines += _bounds_lines(outputs.Bounds.of(found), _in_metres(found.crs))
+    lines += _bounds_lines(outputs.Bounds.of(found), metric=not unit_warnings(found.crs))
     lines += _crs_lines(found.crs)
     if tuple(found.viewpoint) != (0, 0, 0, 1, 0, 0, 0):
         lines.append(("viewpoint", " ".join(f"{value:g}" for value in found.viewpoint)))

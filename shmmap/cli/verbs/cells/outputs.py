@@ -223,6 +223,8 @@ class CloudFile(msgspec.Struct):
     @classmethod
     def of(cls, found: CloudDescription) -> CloudFile:
         """Return the JSON form of a file's description."""
+        from shmmap.formats.coordinate_system import unit_warnings
+
         crs = found.crs
         return cls(
             found.path,
@@ -234,7 +236,15 @@ class CloudFile(msgspec.Struct):
             found.dropped,
             found.width,
             found.height,
-            [Field(spec.name, spec.dtype.str, spec.components, spec.unit) for spec in found.columns],
+            [
+                Field(
+                    spec.name,
+                    spec.dtype.str,
+                    spec.components,
+                    "" if spec.name == "xyz" and unit_warnings(crs) else spec.unit,
+                )
+                for spec in found.columns
+            ],
             Bounds.of(found),
             list(found.viewpoint),
             list(found.warnings),

@@ -36,7 +36,7 @@ def test_a_directory_is_a_line_a_file_and_totals(tmp_path: Path, verb: Verb) -> 
     cloud(tmp_path / "map" / "inner" / "b.pcd", 100, 20)
     (tmp_path / "map" / "notes.txt").write_text("no cloud")
     lines = verb(["inspect", str(tmp_path / "map")]).out.splitlines()
-    assert lines[0].split() == ["FILE", "FORMAT", "SIZE", "POINTS", "NOT", "FINITE", "X", "Y", "Z", "FIELDS"]
+    assert lines[0].split() == ["FILE", "FORMAT", "SIZE", "POINTS", "LEFT", "OUT", "X", "Y", "Z", "FIELDS"]
     assert re.match(
         r"a\.pcd\s+pcd binary\s.*\s10\s+0\s+0 \.\. 9\s+0 \.\. 9\s+0 \.\. 0\.9\s+x y z "
         "intensity ring",
