@@ -279,7 +279,7 @@ class Cell:
         from shmmap.open3d_loading import load_open3d
 
         open3d = load_open3d("to_open3d()")
-        cloud = open3d.t.geometry.PointCloud()
+        cloud: open3d.t.geometry.PointCloud = open3d.t.geometry.PointCloud()
         for name, view in self._writable().items():
             # Open3D wants a row per point, also where a point has one value
             rows = view if view.ndim > 1 else view.reshape(-1, 1)
