@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Callable, Container, Iterable, Sequence
 from pathlib import Path
 from types import FrameType
-from typing import IO, Any, Final, NoReturn
+from typing import Any, Final, NoReturn, TextIO
 
 from shmmap.cli.compiling_lines import CompilingLines
 from shmmap.compile_notices import watch
@@ -71,7 +71,7 @@ class Parser(argparse.ArgumentParser):
             self._refuse(f"unknown option {word}", word)
         self._refuse(f"unexpected argument: {' '.join(unknown)}", word)
 
-    def _print_message(self, message: str, file: IO[str] | None = None) -> None:
+    def _print_message(self, message: str, file: Any = None) -> None:
         # argparse ignores errors of writing here, so that help for a full disk would be lost with exit code 0
         if message:
             stream = file or sys.stderr
@@ -208,15 +208,22 @@ def _show_warnings(name: str) -> None:
     """From now on print a `ShmmapWarning` as its text alone: a line of the library means nothing here."""
     before = warnings.showwarning
 
-    def show(message: Warning | str, category: type[Warning], *where: Any) -> None:
+    def show(
+        message: Warning | str,
+        category: type[Warning],
+        filename: str,
+        lineno: int,
+        file: TextIO | None = None,
+        line: str | None = None,
+    ) -> None:
         if not issubclass(category, ShmmapWarning):
-            before(message, category, *where)
+            before(message, category, filename, lineno, file, line)
             return
         from shmmap.cli.screens.output import print_line
 
         first, *more = str(message).splitlines()
-        for line in (f"{name}: {first}", *more):
-            print_line(line, file=sys.stderr)
+        for text in (f"{name}: {first}", *more):
+            print_line(text, file=sys.stderr)
 
     warnings.showwarning = show
 

@@ -278,12 +278,12 @@ class Cell:
         """
         from shmmap.open3d_loading import load_open3d
 
-        open3d = load_open3d("to_open3d()")
-        cloud = open3d.t.geometry.PointCloud()
+        o3d = load_open3d("to_open3d()")
+        cloud: open3d.t.geometry.PointCloud = o3d.t.geometry.PointCloud()
         for name, view in self._writable().items():
             # Open3D wants a row per point, also where a point has one value
             rows = view if view.ndim > 1 else view.reshape(-1, 1)
-            cloud.point["positions" if name == "xyz" else name] = open3d.core.Tensor.from_numpy(rows)
+            cloud.point["positions" if name == "xyz" else name] = o3d.core.Tensor.from_numpy(rows)
         return cloud
 
     def to_torch(self) -> dict[str, torch.Tensor]:

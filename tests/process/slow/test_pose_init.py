@@ -102,10 +102,8 @@ def test_of_levels_above_each_other_the_rough_height_chooses(
             assert found.failed_limits == ("level",)
             low, high = found.grounds
             assert found.level_doubt == f"two grounds, {low:.1f} and {high:.1f} m: the scan fits both"
-            heights = {
-                round(float(T[2, 3] - z)) for T in (found, *found.alternatives) for T in [T.T_map_base]
-            }
-            assert heights == {0, 8}
+            poses = [found.T_map_base, *(one.T_map_base for one in found.alternatives)]
+            assert {round(float(T[2, 3] - z)) for T in poses} == {0, 8}
     program = ["--endpoint", one.endpoint, "--scan", str(file), "--height", "1.8", "--map-radius", "60"]
     done = pose_init(*program, "--pose", f"{x + 1},{y - 1},{yaw}", "--pose-format", "xyyaw")
     assert done.returncode == 1, done.stderr

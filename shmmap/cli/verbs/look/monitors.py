@@ -69,9 +69,8 @@ def run_health(args: argparse.Namespace) -> int:
         print_json(Health(state, beat_age_s, identity.pid, identity.instance, defects, troubles))
     else:
         age = format_duration(found.beat_age_s)
-        shown = "paused" if state == "stopped" else state
-        if args.strict and troubles and state == "healthy":
-            shown = "unhealthy"
+        lacking = bool(args.strict and troubles and state == "healthy")
+        shown = "unhealthy" if lacking else "paused" if state == "stopped" else state
         print_line(f"{shown}: pid {identity.pid}, last heartbeat {age} ago{_defects(found)}")
         if lost:
             print_line(
