@@ -69,7 +69,7 @@ def test_a_disk_cache_in_order(ward: Ward, monkeypatch: pytest.MonkeyPatch) -> N
     assert (found.state, found.advice) == ("ok", "")
     assert found.fact.startswith("/var/town: 16.0 KiB of 1.0 MiB used, ")
     monkeypatch.setenv("CACHE_DIRECTORY", "/var/town")
-    assert memory.check_disk_cache(ward.diagnosis(uid=uid)).fact.startswith("/var/town: 9.8 KiB of 8.0 GiB")
+    assert memory.check_disk_cache(ward.diagnosis(uid=uid)).fact.startswith("/var/town: 16.0 KiB of 8.0 GiB")
     found = memory.check_disk_cache(ward.diagnosis(uid=uid, cache_dir="/var/town/layers/ab/1.layer"))
     assert (found.state, found.fact) == ("warn", "/var/town/layers/ab/1.layer is no directory")
 
