@@ -22,6 +22,7 @@ __all__ = [
     "PRIVATE",
     "UNWRITABLE",
     "NotPrivate",
+    "open_own",
     "open_private",
     "opened_private",
     "require_private",
@@ -51,7 +52,7 @@ class NotPrivate(PermissionError):
         super().__init__(errno.EPERM, f"it {why}", os.fspath(path))
         self.why = why
         self.hint = (
-            f"chmod go-w {os.fspath(path)}, or remove it"
+            f"remove it; or, if no other account has put anything there, chmod go-w {os.fspath(path)}"
             if why.startswith(_OPEN)
             else "see who made it and remove it, or use another directory"
         )
@@ -154,6 +155,24 @@ def opened_private(
         yield fd
     finally:
         os.close(fd)
+
+
+def open_own(path: str, flags: int, *, dir_fd: int | None = None) -> int:
+    """Open a file of a private directory that this user has made, and return its descriptor.
+
+    A new one is made with mode 0600.  Waits for nothing, such as the writer of a pipe.
+
+    Raises
+    ------
+    OSError
+        It is missing, a link, no regular file, another user's, or has a second name elsewhere.
+    """
+    fd = os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o600, dir_fd=dir_fd)
+    status = os.fstat(fd)
+    if stat.S_ISREG(status.st_mode) and status.st_nlink == 1 and status.st_uid == os.geteuid():
+        return fd
+    os.close(fd)
+    raise OSError(errno.EPERM, "it is not a file that this user has made there", path)
 
 
 def require_private(path: str | os.PathLike[str], *, make: int = PRIVATE, refused: int = UNWRITABLE) -> None:

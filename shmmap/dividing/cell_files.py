@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import os
 import resource
-import stat
 import threading
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -27,12 +26,12 @@ from shmmap.dividing.lattice import CellLattice
 from shmmap.errors import BadRequest
 from shmmap.formats.pcd.writer import pcd_header
 from shmmap.origin.metadata import METADATA_NAME, metadata_text
+from shmmap.private_directory import open_own
 
 __all__ = ["CellFiles", "Slot", "pcd_fields", "raise_open_files_limit", "write_at", "write_metadata"]
 
 _ALIGNMENT: Final = 64
 _SPARE_DESCRIPTORS: Final = 128
-_JOURNAL_FLAGS: Final = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
 _MAX_POINTS: Final = (1 << 32) - 1
 
 _PIECE: Final = np.dtype([("ix", "<i8"), ("iy", "<i8"), ("at", "<i8"), ("bytes", "<i8"), ("hash", "<u8")])
@@ -78,7 +77,7 @@ class CellFiles:
         self._descriptors: dict[tuple[int, int], int] = {}
         soft, _hard = resource.getrlimit(resource.RLIMIT_NOFILE)
         self._max_open = max(16, soft - _SPARE_DESCRIPTORS)
-        self._journal = os.open(journal, _JOURNAL_FLAGS, 0o600) if journal else -1
+        self._journal = open_own(journal, os.O_RDWR | os.O_CREAT) if journal else -1
         self._journal_lock = threading.Lock()
 
     def path(self, where: tuple[int, int]) -> str:
@@ -168,11 +167,8 @@ class CellFiles:
     def _verify(self, where: tuple[int, int], pieces: NDArray[Any]) -> None:
         """Compare a cell's file with its pieces, in order of their places, and cut off what comes after."""
         path = self.path(where)
-        fd = os.open(path, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+        fd = open_own(path, os.O_RDWR)
         try:
-            status = os.fstat(fd)
-            if not stat.S_ISREG(status.st_mode) or status.st_nlink != 1:
-                raise OSError(f"{path} is not the file that was written")
             end = self.header_bytes
             for _, _, at, nbytes, digest in pieces.tolist():
                 if at != end or xxh3_64_intdigest(os.pread(fd, nbytes, at)) != digest:

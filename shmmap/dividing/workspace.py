@@ -27,14 +27,12 @@ from typing import Any, Final
 
 from shmmap.errors import InstanceBusy, ShmmapError
 from shmmap.formats.durable_file import flush_directory, writing_errors
-from shmmap.private_directory import PRIVATE, NotPrivate, open_private, within
+from shmmap.private_directory import PRIVATE, NotPrivate, open_own, open_private, within
 
 __all__ = ["Workspace"]
 
 _STATE: Final = "state.json"
 _LOCK: Final = "lock"
-_LOCK_FLAGS: Final = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
-_READ_FLAGS: Final = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 _EXCHANGES: Final = 100  # times that the directory may be removed by its last holder, or exchanged
 _RENAME_EXCHANGE: Final = 2  # from linux/fs.h
 _AT_FDCWD: Final = -100  # from fcntl.h
@@ -84,10 +82,8 @@ class Workspace:
                 undo.callback(os.close, fd)
                 if (names := os.listdir(fd)) and _LOCK not in names:
                     raise NotPrivate(self._name, "is not of an interrupted run")
-                lock = os.open(_LOCK, _LOCK_FLAGS, 0o600, dir_fd=fd)
+                lock = open_own(_LOCK, os.O_RDWR | os.O_CREAT, dir_fd=fd)
                 undo.callback(os.close, lock)
-                if not stat.S_ISREG(os.fstat(lock).st_mode):
-                    raise NotPrivate(self._name, "is not of an interrupted run")
                 try:
                     fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 except BlockingIOError:
@@ -122,7 +118,7 @@ class Workspace:
     def state(self) -> dict[str, Any] | None:
         """Return the state saved last since the machine started; None if no run can be resumed."""
         try:
-            with open(os.open(_STATE, _READ_FLAGS, dir_fd=self._fd), "rb") as file:
+            with open(open_own(_STATE, os.O_RDONLY, dir_fd=self._fd), "rb") as file:
                 state = json.loads(file.read())
         except (OSError, ValueError):
             return None

@@ -126,4 +126,4 @@ def writing_errors(what: str) -> Iterator[None]:
         raise CannotWrite(
             f"cannot write {error.filename or what}: {error.strerror or error}",
             hint=getattr(error, "hint", "") or _HINTS.get(error.errno or 0, ""),
-        ) from error
+        ) from None

@@ -101,7 +101,8 @@ class LayerCache:
     def _opened(self, *, make: bool = False) -> contextlib.AbstractContextManager[int]:
         """Open the directory for one operation; it must be this account's or root's, and closed to others."""
         if make:
-            os.makedirs(os.path.dirname(self.directory), mode=_MODE, exist_ok=True)
+            with contextlib.suppress(FileExistsError):  # no directory, as the next line says
+                os.makedirs(os.path.dirname(self.directory), mode=_MODE, exist_ok=True)
         return opened_private(self.directory, make=_MODE if make else 0, or_root=True)
 
     # --- lookup ---------------------------------------------------------------------------------
@@ -216,8 +217,8 @@ class LayerCache:
         except OSError as error:
             raise CannotWrite(
                 f"layers cannot be kept in {self.directory}: {error.strerror}",
-                hint="name another --cache-dir",
-            ) from error
+                hint="; ".join(filter(None, (getattr(error, "hint", ""), "name another --cache-dir"))),
+            ) from None
 
     def store(self, key: CacheKey, header: SegmentHeader, fd: int) -> bool:
         """Store a finished segment whose publish block is still empty; return False if there is no room.

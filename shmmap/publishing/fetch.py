@@ -12,7 +12,6 @@ import json
 import mmap
 import os
 import secrets
-import stat
 import threading
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -37,6 +36,7 @@ from shmmap.origin.remote.published_index import Root
 from shmmap.origin.remote.published_object import POINTS, ObjectName, read_bare_header, rows_of
 from shmmap.origin.remote.store import Store
 from shmmap.origin.remote.zstd_frame import DAMAGED, unpack_frame
+from shmmap.private_directory import open_own
 from shmmap.processes.request_threads import RequestThreads
 from shmmap.progress import Progress
 from shmmap.work_room import WorkRoom
@@ -270,8 +270,8 @@ class _Finished:
     """The names of finished files with their hashes: a line for each, of which the last may be cut."""
 
     def __init__(self, path: str) -> None:
-        flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
-        self._file = open(os.open(path, flags, 0o600), "r+b", buffering=0)  # noqa: SIM115  closed by __exit__
+        fd = open_own(path, os.O_RDWR | os.O_CREAT | os.O_APPEND)
+        self._file = open(fd, "r+b", buffering=0)  # noqa: SIM115  closed by __exit__
         self._lock = threading.Lock()
         self._digests: dict[str, str] = {}
         for line in self._file.readall().split(b"\n"):
@@ -306,13 +306,13 @@ class _Finished:
 
 
 def _digest_of(path: str) -> str:
-    """Return the hash of a regular file that has no other name; OSError for anything else."""
-    fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+    """Return the hash of a file that this user has made; OSError for anything else."""
+    fd = open_own(path, os.O_RDONLY)
     try:
-        status = os.fstat(fd)
-        if not stat.S_ISREG(status.st_mode) or status.st_nlink != 1 or not status.st_size:
-            raise OSError(f"{path} is not a file that was fetched")
-        with mmap.mmap(fd, status.st_size, prot=mmap.PROT_READ) as content:
+        size = os.fstat(fd).st_size
+        if not size:
+            raise OSError(f"{path} is empty")
+        with mmap.mmap(fd, size, prot=mmap.PROT_READ) as content:
             return xxh3_128_hexdigest(content)
     finally:
         os.close(fd)

@@ -41,7 +41,7 @@ def closed_too_late(path: Path, victim: Path, mode: int = 0o777) -> None:
 PLANTED: dict[str, tuple[Plant, str]] = {
     "is a symbolic link": (lambda path, victim: path.symlink_to(victim), "see who made it and remove it"),
     "is no directory": (lambda path, _: path.write_text("x"), "see who made it"),
-    "may be written by other users (mode 0777)": (closed_too_late, "chmod go-w "),
+    "may be written by other users (mode 0777)": (closed_too_late, "remove it; or, if"),
     "may be written by other users (mode 0775)": (
         lambda path, victim: closed_too_late(path, victim, 0o775),
         "chmod go-w",
@@ -119,7 +119,7 @@ def test_state_of_another_account_is_not_taken(tmp_path: Path) -> None:
     origins = tmp_path / "origins"
     origins.chmod(0o777)
     assert file.load() is None
-    assert f"{origins}: it may be written by other users (mode 0777) (chmod go-w {origins}" in file.problem
+    assert f"{origins}: it may be written by other users (mode 0777) (remove it" in file.problem
     with pytest.raises(CannotWrite, match="may be written"):
         file.save(taken)
     origins.chmod(0o700)

@@ -629,18 +629,18 @@ def test_objects_are_unpacked_within_a_limit(
     store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With room for less than one, they are unpacked one after another."""
+    from shmmap.origin.remote.published_object import rows_of
     from shmmap.publishing import fetch
 
     at_work, most = [0], [0]
     lock = threading.Lock()
-    real = fetch.rows_of
 
     def counted(*arguments: Any) -> Any:
         with lock:
             at_work[0] += 1
             most[0] = max(most[0], at_work[0])
         try:
-            return real(*arguments)
+            return rows_of(*arguments)
         finally:
             with lock:
                 at_work[0] -= 1

@@ -67,9 +67,9 @@ def test_a_disk_cache_in_order(ward: Ward, monkeypatch: pytest.MonkeyPatch) -> N
     ward.file(f"/var/town/objects/cells/ab/{1:064x}", "x" * 5000)
     found = memory.check_disk_cache(ward.diagnosis(uid=uid, cache_dir="/var/town", cache_bytes=1 << 20))
     assert (found.state, found.advice) == ("ok", "")
-    assert found.fact.startswith("/var/town: 9.8 KiB of 1.0 MiB used, ")
+    assert found.fact.startswith("/var/town: 16.0 KiB of 1.0 MiB used, ")
     monkeypatch.setenv("CACHE_DIRECTORY", "/var/town")
-    assert memory.check_disk_cache(ward.diagnosis(uid=uid)).fact.startswith("/var/town: 9.8 KiB of 8.0 GiB")
+    assert memory.check_disk_cache(ward.diagnosis(uid=uid)).fact.startswith("/var/town: 16.0 KiB of 8.0 GiB")
     found = memory.check_disk_cache(ward.diagnosis(uid=uid, cache_dir="/var/town/layers/ab/1.layer"))
     assert (found.state, found.fact) == ("warn", "/var/town/layers/ab/1.layer is no directory")
 
