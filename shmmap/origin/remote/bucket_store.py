@@ -343,7 +343,7 @@ async def _fill(body: Body, result: obstore.GetResult) -> None:
 
 def _out_of_reach(name: str, text: str) -> Offline:
     """Return our error for the text of an obstore error; only parts without secrets are repeated."""
-    if _NOWHERE in text or "redirect" in text.lower() or _MOVED.search(text):
+    if _NOWHERE in text or _MOVED.search(text):
         return StoreRefused(f"{name}: refused, it is somewhere else", hint=_REGION)
     if _UNASKED.search(text):
         return unasked_304(name)
@@ -357,6 +357,8 @@ def _out_of_reach(name: str, text: str) -> Offline:
         if why := _reason(text):
             return StoreRefused(f"{name}: refused, {why}", hint=hint, of_credentials=True)
         return StoreRefused(f"{name}: refused (status {status})", hint=hint)
+    if "redirect" in text.lower():
+        return StoreRefused(f"{name}: refused, it is somewhere else", hint=_REGION)
     if "certificate" in text.lower():
         return StoreRefused(f"{name}: the server's certificate is not accepted", hint=_CERTIFICATE)
     in_time = " in time" if "kind: Timeout" in text else ""

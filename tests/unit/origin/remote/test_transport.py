@@ -202,7 +202,7 @@ def test_a_panic_is_the_failure_of_its_request(web: FaultyWeb) -> None:
     """Values that nothing has checked make obstore panic, which is no `Exception`."""
     from obstore.store import S3Store
 
-    store = opened(web, "s3")
+    store = opened(web, "s3", AGAIN)
     bad = {"access_key_id": "key\nspoilt", "secret_access_key": "b", "endpoint": web.url, "region": "r"}
     vars(store)["_store"] = S3Store("maps", config=bad, client_options={"allow_http": True})  # type: ignore[arg-type]
     found: list[str] = []
