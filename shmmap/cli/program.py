@@ -124,15 +124,10 @@ def exit_code_of(name: str, run: Callable[[], int]) -> int:
         return _EXIT_BROKEN_PIPE
     except KeyboardInterrupt:
         _forget_interrupt()
-        _leave_requests(_EXIT_INTERRUPTED)
         return _EXIT_INTERRUPTED
-    except SystemExit as ended:
-        _leave_requests(ended.code)
-        raise
     except Exception as error:  # noqa: BLE001
         if _is_of_interrupt(error):
             _forget_interrupt()
-            _leave_requests(_EXIT_INTERRUPTED)
             return _EXIT_INTERRUPTED
         if isinstance(error, OSError) and error.errno in _FULL and error.filename is None:
             _drop_output()
@@ -150,15 +145,6 @@ def exit_code_of(name: str, run: Callable[[], int]) -> int:
         )
         return InternalError.exit_code
     return code
-
-
-def _leave_requests(code: object) -> None:
-    """Exit at once if threads still wait for answers of a store, since the interpreter would wait, too."""
-    pools = sys.modules.get("shmmap.processes.request_threads")
-    if pools is not None and isinstance(code, int) and pools.requests_under_way():
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
 
 
 def _forget_interrupt() -> None:

@@ -11,6 +11,7 @@ from typing import Any, Final, TypeVar
 
 from shmmap.errors import Offline
 from shmmap.origin.remote.transport import too_slow
+from shmmap.processes.request_threads import PREFIX
 
 __all__ = ["run_coroutine", "within"]
 
@@ -53,6 +54,6 @@ def _running_loop() -> asyncio.AbstractEventLoop:
     with _starting:
         if _loop is None or _loop[0] != os.getpid():
             loop = asyncio.new_event_loop()
-            threading.Thread(target=loop.run_forever, name="requests", daemon=True).start()
+            threading.Thread(target=loop.run_forever, name=f"{PREFIX}loop", daemon=True).start()
             _loop = os.getpid(), loop
         return _loop[1]

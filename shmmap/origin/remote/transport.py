@@ -17,6 +17,7 @@ from typing import Final, NoReturn, TypeVar
 from shmmap.errors import BadRequest, MapDataError, Offline
 from shmmap.origin.remote.store import WEB_SCHEMES, StoreRefused, StoreUrl, is_loopback
 from shmmap.origin.remote.zstd_frame import DAMAGED
+from shmmap.processes.request_threads import PREFIX
 
 __all__ = [
     "BETWEEN",
@@ -194,7 +195,7 @@ def call_apart(call: Callable[[], _Answer]) -> _Answer:
             future.set_exception(error)
 
     try:
-        threading.Thread(target=run, name="request", daemon=True).start()
+        threading.Thread(target=run, name=f"{PREFIX}apart", daemon=True).start()
     except RuntimeError:  # the system allows no more threads
         return call()
     return future.result()

@@ -34,6 +34,7 @@ from shmmap.origin.remote.verify_apart import (
     read_trusted_root,
 )
 from shmmap.processes.end_with_parent import die_with
+from shmmap.processes.request_threads import leave
 from shmmap.quantities import format_utc
 
 if TYPE_CHECKING:
@@ -250,4 +251,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    leave(main())
