@@ -133,9 +133,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     Parameters
     ----------
     argv
-        Words after the program's name; by default the arguments of this process.
+        Words after the program's name; by default the arguments of this process, which then ends here if
+        threads have made requests.
     """
-    words = join_negative_values(verb_first(sys.argv[1:] if argv is None else argv), NUMBER_OPTIONS)
+    if argv is None:
+        return _ended_by(sys.argv[1:])
+    words = join_negative_values(verb_first(argv), NUMBER_OPTIONS)
 
     def run() -> int:
         if not words:
@@ -151,4 +154,15 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def serve_main() -> int:
     """Run ``shmmapd``, the same as ``shmmap serve``."""
-    return main(["serve", *sys.argv[1:]])
+    return _ended_by(["serve", *sys.argv[1:]])
+
+
+def _ended_by(words: Sequence[str]) -> int:
+    """Run a verb as this process; see `shmmap.processes.request_threads.leave`."""
+    try:
+        code: object = main(words)
+    except SystemExit as ended:
+        code = ended.code or 0
+    if (threads := sys.modules.get("shmmap.processes.request_threads")) is not None:
+        threads.leave(code)
+    sys.exit(code)  # type: ignore[arg-type]

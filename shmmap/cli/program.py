@@ -130,22 +130,16 @@ def exit_code_of(name: str, run: Callable[[], int]) -> int:
         code = _flushed(run)
     except ShmmapError as error:
         complain(name, error.message, error.hint)
-        _leave_requests(error.exit_code)
         return error.exit_code
     except BrokenPipeError:
         _drop_output()
         return _EXIT_BROKEN_PIPE
     except KeyboardInterrupt:
         _forget_interrupt()
-        _leave_requests(_EXIT_INTERRUPTED)
         return _EXIT_INTERRUPTED
-    except SystemExit as ended:
-        _leave_requests(ended.code)
-        raise
     except Exception as error:  # noqa: BLE001
         if _is_of_interrupt(error):
             _forget_interrupt()
-            _leave_requests(_EXIT_INTERRUPTED)
             return _EXIT_INTERRUPTED
         if isinstance(error, OSError) and error.errno == errno.EIO and error.filename is None:
             _drop_output()  # of a terminal that is gone
@@ -165,17 +159,7 @@ def exit_code_of(name: str, run: Callable[[], int]) -> int:
             "this is a defect in shmmap: please report it with the lines above",
         )
         return InternalError.exit_code
-    _leave_requests(code)
     return code
-
-
-def _leave_requests(code: object) -> None:
-    """Exit at once if threads still wait for answers of a store: the interpreter would wait, or abort."""
-    pools = sys.modules.get("shmmap.processes.request_threads")
-    if pools is not None and isinstance(code, int) and pools.requests_under_way():
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
 
 
 def _flushed(run: Callable[[], int]) -> int:

@@ -21,6 +21,7 @@ from shmmap.layers.points import LAYER
 from shmmap.layers.sources import FILES, CellJob, CellSource, SourceReader
 from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.prepare.task_pool import CellDone, CellTask, LayerDone, Ready, decode_task, encode
+from shmmap.processes.request_threads import leave
 from shmmap.processes.start_child import MAX_PACKET_BYTES, channel_to_parent
 from shmmap.segment.version import Source
 
@@ -146,4 +147,4 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    leave(main(sys.argv[1:]))

@@ -3,33 +3,40 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from types import TracebackType
-from typing import Final
+from typing import Final, NoReturn
 
-__all__ = ["REQUEST", "RequestThreads", "requests_under_way"]
+__all__ = ["PREFIX", "RequestThreads", "leave"]
 
-REQUEST: Final = "request-"
-"""Prefix of the names of threads with a request."""
+PREFIX: Final = "request-"
+"""How the names of threads begin that make requests, or wait for them."""
 
 
 class RequestThreads(ThreadPoolExecutor):
     """A pool of threads for requests to a store; ``with`` waits for them, but not after an interrupt."""
 
     def __init__(self, threads: int, name: str) -> None:
-        super().__init__(threads, f"{REQUEST}{name}")
+        super().__init__(threads, f"{PREFIX}{name}")
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        is_interrupt = kind is not None and issubclass(kind, KeyboardInterrupt | SystemExit)
+        is_interrupt = kind is not None and not issubclass(kind, Exception)
         self.shutdown(wait=not is_interrupt, cancel_futures=kind is not None)
 
 
-def requests_under_way() -> bool:
-    """Whether threads with a request have not ended.
+def leave(code: object) -> NoReturn:
+    """End this process: without the interpreter's own end if there are threads for requests.
 
-    Python would wait for those of a pool at its exit, and abort if one returns from native code then.
+    The interpreter would wait for requests under way.  And a thread of obstore that has just delivered an
+    answer aborts the process if the interpreter ends at that moment.
     """
-    return any(thread.name.startswith(REQUEST) for thread in threading.enumerate())
+    if any(thread.name.startswith(PREFIX) for thread in threading.enumerate()):
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code if isinstance(code, int) else 0)
+    sys.exit(code)  # type: ignore[arg-type]

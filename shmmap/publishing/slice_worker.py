@@ -34,6 +34,7 @@ from shmmap.origin.remote.published_object import (
 )
 from shmmap.origin.remote.zstd_frame import unpack_frame
 from shmmap.prepare.task_pool import CellTask, Ready, decode_task, encode
+from shmmap.processes.request_threads import leave
 from shmmap.processes.start_child import MAX_PACKET_BYTES
 from shmmap.publishing.messages import TASKS_AHEAD, CellSent, KnownObjects, NotSent, SliceSettings
 from shmmap.publishing.worker import CellMaker, Sender, make_and_send, run_worker
@@ -206,4 +207,4 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    leave(main(sys.argv[1:]))

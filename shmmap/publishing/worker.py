@@ -38,6 +38,7 @@ from shmmap.origin.remote.published_object import (
 from shmmap.origin.remote.store import Store
 from shmmap.prepare.task_pool import CellTask, Ready, decode_task, encode
 from shmmap.prepare.worker import CellPoints
+from shmmap.processes.request_threads import leave
 from shmmap.processes.start_child import MAX_PACKET_BYTES, channel_to_parent
 from shmmap.publishing.messages import (
     TASKS_AHEAD,
@@ -309,4 +310,4 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    leave(main(sys.argv[1:]))

@@ -180,6 +180,8 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         self.server.web.note(path, 0)
         for piece in pieces(data):
             self.wfile.write(piece)
+            if self.command == "HEAD" and piece.startswith(b"HTTP/1.1 200"):
+                return
 
     def _answer(self, status: int, data: bytes, tag: str = "", *, partly: str = "", fault: str = "") -> None:
         self.server.web.note(self.path.lstrip("/"), status)

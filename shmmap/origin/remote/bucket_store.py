@@ -470,7 +470,7 @@ def _out_of_reach(name: str, text: str) -> Offline:
     if why := _reason(text):
         hint = _HINTS.get(why, hint)
         return StoreRefused(f"{name}: refused, {why}", hint=hint, of_credentials=True, status=status)
-    if _NOWHERE in text or "redirect" in text.lower() or _MOVED.search(text):
+    if _NOWHERE in text or _MOVED.search(text):
         return StoreRefused(f"{name}: refused, it is somewhere else", hint=_REGION)
     if _UNASKED.search(text):
         return unasked_304(name)
@@ -481,6 +481,8 @@ def _out_of_reach(name: str, text: str) -> Offline:
             return StoreRefused(f"{name}: {says}", hint=hint)
     if status:
         return StoreRefused(f"{name}: refused (status {status})", hint=hint, status=status)
+    if "redirect" in text.lower():
+        return StoreRefused(f"{name}: refused, it is somewhere else", hint=_REGION)
     if "certificate" in text.lower():
         return StoreRefused(f"{name}: the server's certificate is not accepted", hint=_CERTIFICATE)
     in_time = " in time" if "kind: Timeout" in text else ""

@@ -18,7 +18,7 @@ from typing import Final, NoReturn, TypeVar
 from shmmap.errors import BadRequest, MapDataError, Offline
 from shmmap.origin.remote.store import WEB_SCHEMES, StoreRefused, StoreUrl, is_loopback
 from shmmap.origin.remote.zstd_frame import DAMAGED
-from shmmap.processes.request_threads import REQUEST
+from shmmap.processes.request_threads import PREFIX
 
 __all__ = [
     "BETWEEN",
@@ -201,7 +201,7 @@ def call_apart(call: Callable[[], _Answer], name: str = "", limit_s: float = mat
             future.set_exception(error)
 
     try:
-        threading.Thread(target=run, name=f"{REQUEST}apart", daemon=True).start()
+        threading.Thread(target=run, name=f"{PREFIX}apart", daemon=True).start()
     except RuntimeError:  # the system allows no more threads
         return call()
     if not wait([future], None if math.isinf(limit_s) else limit_s).done:

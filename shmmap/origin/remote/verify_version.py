@@ -35,6 +35,7 @@ from shmmap.origin.remote.verify_apart import (
 )
 from shmmap.private_directory import require_private
 from shmmap.processes.end_with_parent import die_with
+from shmmap.processes.request_threads import leave
 from shmmap.quantities import format_utc
 
 if TYPE_CHECKING:
@@ -251,4 +252,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    leave(main())

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -230,13 +231,13 @@ def test_a_value_with_a_line_break_is_refused_by_the_name_of_its_place(home: Pat
     says, value = SPOILT[character], f"{SECRET}{character}{SECRET}"
     keys = {"AWS_ACCESS_KEY_ID": "a", "AWS_SECRET_ACCESS_KEY": "b", "AWS_SESSION_TOKEN": "c"}
     for name in (*keys, "AWS_REGION", "AWS_ENDPOINT_URL"):
-        refused(lambda name=name: s3({**keys, name: value}), name, says)
+        refused(partial(s3, {**keys, name: value}), name, says)
     for name in ("AZURE_STORAGE_ACCOUNT_KEY", "AZURE_STORAGE_SAS_TOKEN", "AZURE_CLIENT_SECRET"):
-        refused(lambda name=name: azure({name: value}), name, says)
+        refused(partial(azure, {name: value}), name, says)
     token = home / "token"
     token.write_text(value, newline="")
     for name in ("AWS_WEB_IDENTITY_TOKEN_FILE", "AWS_CONTAINER_AUTHORIZATION_TOKEN_FILE"):
-        refused(lambda name=name: s3({name: str(token)}, instance=True), str(token), says)
+        refused(partial(s3, {name: str(token)}, instance=True), str(token), says)
     if character == "\u200b":
         profile(home / ".aws/credentials", aws_session_token=value)
         refused(lambda: s3({}), "aws_session_token", says)
