@@ -11,7 +11,7 @@ from __future__ import annotations
 import random
 import secrets
 import time
-from typing import Final, NamedTuple, Protocol
+from typing import Final, Literal, NamedTuple, Protocol, TypeAlias
 
 from shmmap.errors import CannotWrite, MapMissing
 from shmmap.origin.remote.store import NoTag, StoreRefused, Tag
@@ -30,6 +30,7 @@ ASKED: Final = "conditions.json"
 """The object that publishers write to find out what the store can do; readers and pruning ignore it."""
 _NEEDED: Final = "PUBLISHING.md says what a store has to do, and which stores do it"
 _OPTION: Final = f"{_NEEDED}; --sole-publisher, if no two programs ever publish there at the same time"
+_Outcome: TypeAlias = Literal["replaced", "kept", "another's"]
 _ROUNDS: Final = 5
 _LONGEST_PAUSE_S: Final = 0.2
 _UNCERTAIN: Final = (408, 429, 500, 502, 503, 504)  # says nothing about conditions
@@ -71,30 +72,41 @@ def ask_conditions(store: ConditionalStore) -> None:
     StoreRefused
         The store does not return what was written: something else answers in its place.
     """
+    outcomes: list[_Outcome] = []
     for _ in range(_ROUNDS):
         first, second = asked_content(), asked_content()
         tag = _written(store, first)
-        replaced = _conditional(store, second, only_if=tag)
-        is_decided = replaced is not None or _was_replaced(store, first, second, tag)
-        ignored = [
-            name
-            for name, answer in (
-                ("If-Match", _conditional(store, asked_content(), only_if=tag)),
-                ("If-None-Match", _conditional(store, asked_content(), create=True)),
-            )
-            if answer is not None
-        ]
-        if ignored:
-            refuse_foreign(store)
-            raise CannotWrite(
-                f"{store.url}: the store ignores the conditions of writes ({' and '.join(ignored)}): of two"
-                " publishers at once, one would lose its version",
-                hint=_OPTION,
-            )
-        if is_decided:
+        is_replaced = _conditional(store, second, only_if=tag) is not None
+        outcome: _Outcome = "replaced" if is_replaced else _after_refusal(store, first, second, tag)
+        if outcome != "kept":  # now the tag is of an earlier state
+            _refuse_ignored(store, tag)
+        if outcome == "replaced":
             return
+        outcomes.append(outcome)
         time.sleep(random.uniform(0.0, _LONGEST_PAUSE_S))  # noqa: S311  no secret
+    if set(outcomes) == {"kept"}:
+        raise CannotWrite(
+            f"{store.url}: the store does not replace an object whose ETag is named: a version cannot be"
+            " replaced",
+            hint=_OPTION,
+        )
     # other publishers keep asking: what could lose a version has been refused each time
+
+
+def _refuse_ignored(store: ConditionalStore, old: Tag) -> None:
+    """Raise `CannotWrite` if the store ignores a condition; ``old`` is the tag of an earlier state."""
+    named = {
+        "If-Match": _conditional(store, asked_content(), only_if=old),
+        "If-None-Match": _conditional(store, asked_content(), create=True),
+    }
+    ignored = [name for name, written in named.items() if written is not None]
+    if ignored:
+        refuse_foreign(store)
+        raise CannotWrite(
+            f"{store.url}: the store ignores the conditions of writes ({' and '.join(ignored)}): of two"
+            " publishers at once, one would lose its version",
+            hint=_OPTION,
+        )
 
 
 def refuse_unsafe_tag(url: str, tag: Tag) -> None:
@@ -159,21 +171,17 @@ def _conditional(
     )
 
 
-def _was_replaced(store: ConditionalStore, first: bytes, second: bytes, tag: Tag) -> bool:
-    """Whether a refused replacement was made after all; False if another publisher asks at the same time."""
+def _after_refusal(store: ConditionalStore, first: bytes, second: bytes, tag: Tag) -> _Outcome:
+    """Return what has become of the object after the store has refused to replace ``first`` by ``second``."""
     seen = refuse_foreign(store)
     if seen.data == first and seen.tag.get("e_tag") not in (None, tag.get("e_tag")):
         refuse_unsafe_tag(store.url, seen.tag)
         if _conditional(store, second, only_if=seen.tag) is not None:
-            return True
+            return "replaced"
         seen = refuse_foreign(store)
-    if seen.data == first:
-        raise CannotWrite(
-            f"{store.url}: the store does not replace an object whose ETag is named: a version cannot be"
-            " replaced",
-            hint=_OPTION,
-        )
-    return seen.data == second  # the answer to an earlier attempt was lost
+    if seen.data == second:  # the answer to an earlier attempt was lost
+        return "replaced"
+    return "kept" if seen.data == first else "another's"
 
 
 def refuse_foreign(store: ConditionalStore) -> Seen:
