@@ -187,7 +187,7 @@ def built_as_it_says(name: str, folder: Path) -> Path:
     library = re.findall(r"--cflags (\w+)", command)[0]
     if subprocess.run(["pkg-config", "--exists", library], check=False).returncode:
         pytest.skip(f"{library} is missing (libpcl-dev, libeigen3-dev)")
-    command = command.replace(f"-o {name}", f"-o {folder / name} -Werror -Wall -Wextra -Wshadow")
+    command = command.replace(f"-o {name}", f"-o {folder / name} -O0 -Werror -Wall -Wextra -Wshadow")
     subprocess.run(["sh", "-euc", command], check=True, cwd=CPP)
     return folder / name
 

@@ -141,7 +141,7 @@ def test_a_gap_is_noticed_and_closed(served: DaemonProcess, connect: Connect, li
     """More happens than any queue holds while the listener does not read: the oldest are `MissedEvents`."""
     client, stream = connect(served), listen(served)
     client.selected(["0_0.pcd"])
-    for _ in range(3000):  # two events each: the daemon remembers 4096
+    for _ in range(2200):  # two events each: the daemon remembers 4096
         client.ask("evict", ["0_0.pcd"])
         client.selected(["0_0.pcd"])
     client.ask("evict", None)

@@ -28,7 +28,7 @@ def compiled_with(types: str, source: Path, folder: Path) -> Path | None:
             return None
         options = ["-DSHMMAP_GENERATED", *found]
     program = folder / source.stem
-    checks = ["-std=c++17", "-Og", "-g1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", *FLAGS]
+    checks = ["-std=c++17", "-O0", "-g1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", *FLAGS]
     subprocess.run(["g++", *checks, *options, str(source), "-o", str(program), "-pthread"], check=True)
     return program
 
