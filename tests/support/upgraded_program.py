@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A program whose package is replaced while it runs: it uses all that is public, and prints how each use ends.
+"""A program whose package is replaced: it uses all that is public, and prints how each use ends.
 
-``python upgraded_program.py ENDPOINT HAS CELL...``, with HAS ``client`` (connected, nothing else) or ``all`` (a
-window, a live map, its mapper and an event stream, too).  It prints a line when it is ready.  For each line that
-it then reads it uses everything, and prints the outcomes as JSON.  The last line names what was loaded since.
+``python upgraded_program.py ENDPOINT HAS GOOD_CELL BROKEN_CELL DIRECTORY MAPPER``, with HAS ``client`` (it is
+connected, nothing else) or ``all`` (a window, a live map, its mapper and an event stream, too).  It prints a
+line when it is ready.  For each line that it then reads it uses everything, and prints the outcomes as JSON.
+Its last line names what was loaded since.
 """
 
 from __future__ import annotations
@@ -85,13 +86,13 @@ CLIENT: Calls = {
     "metadata": [
         lambda c: c.metadata(),
         lambda c: c.metadata(circle(x=9e3)),
-        lambda c: list(c.metadata())[0],
+        lambda c: next(iter(c.metadata())),
     ],
     "live": [lambda c: c.live("lidar"), lambda c: c.live("radar")],
     "show": [lambda c: c.show(GOOD), lambda c: c.show("no such cell")],
     "pin": [lambda c: c.pin(GOOD), lambda c: c.pin("no such cell")],
     "evict": [lambda c: c.evict(), lambda c: c.evict(GOOD)],
-    "close": [lambda c: closed(shmmap.connect(ENDPOINT)), lambda c: shmmap.connect("/nowhere/at/all.sock")],
+    "close": [lambda _: closed(shmmap.connect(ENDPOINT)), lambda _: shmmap.connect("/nowhere/at/all.sock")],
     "shutdown": [],  # the daemon is killed instead
 }
 CELL: Calls = {
@@ -111,7 +112,7 @@ WINDOW: Calls = {
     "points_around": [lambda w: w.points_around(0, 0, 5), lambda w: w.points_around(9000, 0, 5)],
     "wait_until_current": [lambda w: w.wait_until_current(WAIT_S[0])],
     "close": [
-        lambda w: closed(shmmap.MapWindow(ENDPOINT, 20, timeout=WAIT_S[0])),
+        lambda _: closed(shmmap.MapWindow(ENDPOINT, 20, timeout=WAIT_S[0])),
         lambda w: closed(shmmap.MapWindow(w.client, 20)),
     ],
 }
@@ -136,7 +137,7 @@ MAPPER: Calls = {
 }
 STREAM: Calls = {
     "next": [lambda s: s.next(0)],
-    "close": [lambda s: closed(shmmap.events.EventStream(ENDPOINT))],
+    "close": [lambda _: closed(shmmap.events.EventStream(ENDPOINT))],
 }
 LAYERS: Calls = {
     "build_layer": [lambda m: m.build_layer("ground", POINTS.astype("f4"))],
