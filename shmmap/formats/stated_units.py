@@ -245,7 +245,7 @@ def units_row(words: Sequence[str]) -> list[LengthUnit | None] | None:
 # --- comments -------------------------------------------------------------------------------------------
 
 _QUANTITY: Final = (
-    r"(?:(?:the|all|of|for|linear|length|distance|measure(?:ment)?|map|file|data|world|scale|xyz|horizontal"
+    r"(?:(?:the|all|of|for|linear|length|distance|measurement|measure|map|file|data|world|scale|xyz|horizontal"
     r"|vertical|values?|dimensions?|coordinates?|coords?|points?|positions?|vert(?:ex|ices)"
     r"|x[ ,]*y[ ,]*(?:and )?z)[\s_]*)"
 )

@@ -103,6 +103,7 @@ def test_names_of_coordinates(names: str, places: tuple[int, int, int] | None) -
         ("all coordinates are given in centimeters", 0.01, 0.01),
         ("x, y and z in feet", FT, FT),
         ("xyz [mm]", 0.001, 0.001),
+        ("unit of measurement: mm", 0.001, 0.001),
         ("made by a tool, units in cm", 0.01, 0.01),
         ("made by a tool. Units: ft. 1000 points.", FT, FT),
         ("Vertical units: ft", None, FT),
