@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable, Container, Iterable, Sequence
 from pathlib import Path
 from types import FrameType
-from typing import IO, Any, Final, NoReturn
+from typing import Any, Final, NoReturn
 
 from shmmap.errors import CannotWrite, InternalError, ShmmapError
 from shmmap.formats.durable_file import writing_errors
@@ -67,7 +67,7 @@ class Parser(argparse.ArgumentParser):
             self._refuse(f"unknown option {word}", word)
         self._refuse(f"unexpected argument: {' '.join(unknown)}", word)
 
-    def _print_message(self, message: str, file: IO[str] | None = None) -> None:
+    def _print_message(self, message: str, file: Any = None) -> None:
         # argparse ignores errors of writing here, so that help for a full disk would be lost with exit code 0
         if message:
             stream = file or sys.stderr
