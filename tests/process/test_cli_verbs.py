@@ -98,7 +98,7 @@ def test_query_names_what_failed(shmmap: Shmmap, divided_map: DividedMap) -> Non
 
 def test_what_is_printed_is_as_the_schemas_say(shmmap: Shmmap) -> None:
     """Nothing more, and nothing less."""
-    shmmap("query", "--circle", "0,0,5", "--layer", "points", "voxel(2)")
+    shmmap("query", "--wait", "60", "--circle", "0,0,5", "--layer", "points", "voxel(2)")
     for words in (
         "status", "top", "health", "ls", "clients", "version", "doctor", "pin 0_0.pcd", "unpin --all",
         "reload", "show 0_0.pcd", "query --circle 0,0,5", "query --id 0_0.pcd nowhere.pcd", "evict --all",
