@@ -2,11 +2,10 @@
 """Whether the package on the disk is still the one that this process runs.
 
 An upgrade replaces files under running programs.  A module imported afterwards would be missing, or of
-another version than those in memory.  So each import of a module of ours is preceded by a look at the package:
-once that was replaced, the import is refused with `Replaced`, and nothing of the new version is ever loaded
-into a process of the old one.  A process that starts a child passes `mark` on, and a child of another version
-ends.
-
+another version than those in memory.  So each import of a module of ours is preceded by a look at the
+package: once that was replaced, the import is refused with `Replaced`, and nothing of the new version is
+ever loaded into a process of the old one.  A process that starts a child passes `mark` on, and a child of
+another version ends.
 A daemon goes on with the processes that it has, until it needs another one.
 
 The look compares inodes and times of the package's directory and of its ``version.py``, which every installer

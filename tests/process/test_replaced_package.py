@@ -93,7 +93,14 @@ def walked(
     site = tmp_path / f"{has}-{happens.__name__}"
     package = copied(site)
     environment = {**os.environ, "PYTHONPATH": str(site), "NUMBA_DISABLE_JIT": "1"}
-    words = [sys.executable, PROGRAM, served.endpoint, has, divided_map.id(GOOD), divided_map.id(BROKEN)]
+    words: list[str | Path] = [
+        sys.executable,
+        PROGRAM,
+        served.endpoint,
+        has,
+        divided_map.id(GOOD),
+        divided_map.id(BROKEN),
+    ]
     with LineProcess(*words, str(site), site.name, env=environment) as program:
         assert program.read() == "ready"
         happens(package)
@@ -113,6 +120,8 @@ def walked(
 def test_a_program_goes_on(served: DaemonProcess, divided_map: DividedMap, tmp_path: Path, has: str) -> None:
     """Whatever was made before goes on as without an upgrade, and a name not used before says what to do."""
     expected, _ = walked(served, divided_map, tmp_path, has, nothing)
+    uncalled = {use for use, ended in expected[0].items() if "missing" in ended}
+    assert not uncalled, "the program needs arguments for these"
     for happens in (removed, replaced):
         found, loaded = walked(served, divided_map, tmp_path, has, happens)
         new, version, _ = json.loads(loaded)

@@ -17,6 +17,8 @@ import sys
 import types
 import warnings
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from operator import methodcaller
 from pathlib import Path
 from typing import Any
 
@@ -175,23 +177,27 @@ def uses_of(label: str, thing: Any, calls: Calls) -> Iterator[tuple[str, Callabl
             continue
         static = getattr(type(thing), name, None)
         if isinstance(thing, types.ModuleType) or not callable(static):
-            yield f"{label}.{name}", lambda name=name: getattr(thing, name)
+            yield f"{label}.{name}", partial(getattr, thing, name)
             for number, call in enumerate(calls.get(name, ())):
-                yield f"{label}.{name}#{number}", lambda call=call: call(thing)
+                yield f"{label}.{name}#{number}", partial(call, thing)
             continue
-        for number, call in enumerate(calls.get(name, [lambda thing, name=name: getattr(thing, name)()])):
-            yield f"{label}.{name}#{number}", lambda call=call: call(thing)
+        for number, call in enumerate(calls.get(name, [methodcaller(name)])):
+            yield f"{label}.{name}#{number}", partial(call, thing)
     yield f"repr({label})", lambda: repr(thing)
     for name in ("__len__", "__iter__"):
         if hasattr(type(thing), name) and label != "stream":
-            yield f"{label}.{name}", lambda name=name: getattr(thing, name)()
+            yield f"{label}.{name}", partial(methodcaller(name), thing)
+
+
+def handed_over(cell: Any) -> Any:
+    return pickle.loads(pickle.dumps(cell))
 
 
 def uses_of_cells(cells: Iterable[Any]) -> Iterator[tuple[str, Callable[[], Any]]]:
     for cell in cells:
-        yield "pickled", lambda cell=cell: pickle.loads(pickle.dumps(cell))
-        yield "pickled copy", lambda cell=cell: pickle.loads(pickle.dumps(cell.copy()))
-        yield "copied", lambda cell=cell: copy.copy(cell)
+        yield "pickled", partial(handed_over, cell)
+        yield "pickled copy", partial(handed_over, cell.copy())
+        yield "copied", partial(copy.copy, cell)
         yield "stale pickle", lambda: pickle.loads(STALE)
 
 
@@ -200,7 +206,7 @@ def names_of(module: str) -> Iterator[tuple[str, Callable[[], Any]]]:
     yield module, lambda: getattr(shmmap, module)
     found = sys.modules.get(f"shmmap.{module}")
     for name in found.__all__ if found is not None else ():
-        yield f"{module}.{name}", lambda name=name: getattr(found, name)
+        yield f"{module}.{name}", partial(getattr, found, name)
 
 
 def walk() -> dict[str, str]:
@@ -219,9 +225,7 @@ def walk() -> dict[str, str]:
     for module in ("errors", "layers", "live", "events"):
         uses += names_of(module)
     if "shmmap.layers" in sys.modules:
-        uses += [
-            (f"layers.{name}()", lambda call=call: call(shmmap.layers)) for name, (call,) in LAYERS.items()
-        ]
+        uses += [(f"layers.{name}()", partial(call, shmmap.layers)) for name, (call,) in LAYERS.items()]
     return {name: outcome(use) for name, use in uses}
 
 
@@ -249,9 +253,9 @@ for line in sys.stdin:
         break
     if line == "dead\n":
         WAIT_S[0] = client.session.timeout_s = 0.02
-        shmmap.client.client.RELOAD_S = shmmap.client.client.RELOAD_CELL_S = 0
+        vars(sys.modules["shmmap.client.client"]).update(RELOAD_S=0, RELOAD_CELL_S=0)
         if HAS == "all":
-            sys.modules["shmmap.client.live.live_map"].LIST_S = 0
+            vars(sys.modules["shmmap.client.live.live_map"]).update(LIST_S=0)
     else:
         WAIT_S[0] = client.session.timeout_s = 10
     print(json.dumps(walk()), flush=True)
