@@ -25,10 +25,11 @@ __all__ = ["add_doctor", "add_health", "add_metrics", "run_doctor", "run_health"
 
 _HEALTH_EXIT = """\
 Exit code: 0 healthy, 1 starting, unreachable, paused or hung, 69 dead or never started; with --strict
-also 1, and `unhealthy`, while clients lack something: shmmap was replaced under the daemon, cells were refused
-in the last minute, cells that were asked for cannot be loaded (they are named if the daemon answers), the
-map's files are out of reach, the map could not be read again or has problems, its signature has expired, the
-version that its origin offers is refused, or a live map has a problem, a damaged file or a missing chunk."""
+also 1, and `unhealthy`, while clients lack something: shmmap was replaced under the daemon, cells were
+refused in the last minute, cells that were asked for cannot be loaded (they are named if the daemon
+answers), the map's files are out of reach, the map could not be read again or has problems, its signature
+has expired, the version that its origin offers is refused, or a live map has a problem, a damaged file or a
+missing chunk."""
 
 
 _NAMED = 3

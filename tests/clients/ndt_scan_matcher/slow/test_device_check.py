@@ -34,7 +34,7 @@ class OnlyThese:
 sys.meta_path.insert(0, OnlyThese())
 from shmmap_clients.ndt_scan_matcher.cli import device_check, main
 device_check.SCENES = device_check.SCENES[2:3]
-device_check._TIMED, device_check._TIMED_BATCHES = 20, 2  # nobody looks at how long they take
+device_check._TIMED, device_check._TIMED_BATCHES = 20, 2  # how long they take is not looked at
 sys.exit(main(sys.argv[1:]))
 """
 
