@@ -56,7 +56,7 @@ def _chunk(data: bytes) -> bytes:
 
 WRONG_ANSWERS: dict[str, Callable[[bytes], Iterable[bytes]]] = {
     "drip head": lambda _: _drip(_head("200 OK", "X-Long: " + "x" * 10_000)),
-    "drip body": lambda data: itertools.chain([_head("200 OK", _length(data))], _drip(data[:-1])),
+    "drip body": lambda data: itertools.chain([_head("200 OK", _length(data * 99))], _drip(data)),
     "drip error": lambda _: itertools.chain([_head("503 Busy", "Content-Length: 9999")], _drip(b"")),
     "drip chunks": lambda data: itertools.chain(
         [_head("200 OK", "Transfer-Encoding: chunked")], map(_chunk, _drip(data))
