@@ -139,7 +139,6 @@ def test_closed_streams_are_no_defect() -> None:
 def test_version_and_its_json(verb: Verb, capsys: pytest.CaptureFixture[str]) -> None:
     import json
 
-
     document = json.loads(verb(["version", "--json"]).out)
     assert document["shmmap"] == build_version()
     assert all(re.fullmatch(r"\d+\.\d+", document[name]) for name in ("protocol", "layout"))
