@@ -21,7 +21,7 @@ _logged: list[str] = []
 def log_first(module: str, _number: int, of: int) -> None:
     """Log the first notice of this process: a `Watcher`."""
     if not _logged:
-        from shmmap.logfmt import log  # takes 5 ms to import
+        from shmmap.logfmt import log  # takes 5 ms to import; a process that compiles has it
 
         _logged.append(module)
         log.info("compiling kernels, once for this version", module=module, kernels=of)

@@ -23,6 +23,7 @@ from typing import Final
 from shmmap.errors import Replaced
 
 __all__ = [
+    "OURS",
     "RESTART",
     "is_installed",
     "is_replaced",
@@ -34,7 +35,9 @@ __all__ = [
 
 RESTART: Final = "shmmap was replaced: restart the daemon"
 
-_OURS: Final = ("shmmap", "shmmap_clients")
+OURS: Final = ("shmmap", "shmmap_clients")
+"""Packages of ours, which are installed and replaced together."""
+
 _DIRECTORY: Final = os.path.dirname(os.path.abspath(__file__))
 _VERSION_FILE: Final = os.path.join(_DIRECTORY, "version.py")
 
@@ -138,10 +141,10 @@ class _OfThisVersion:
         """Return None: other finders find the module."""
         del path, target
         top, _, inner = name.partition(".")
-        if top not in _OURS or not mark:
+        if top not in OURS or not mark:
             return
         # cheaper than `is_replaced`: each import comes here
-        if _look() != mark or (inner and top == _OURS[0] and _modules and _has_changed(name)):
+        if _look() != mark or (inner and top == OURS[0] and _modules and _has_changed(name)):
             raise _refusal(name)
 
 

@@ -16,7 +16,7 @@ from contextlib import contextmanager, suppress
 from typing import Any, Final
 
 from shmmap.errors import PackageMissing
-from shmmap.installed import refuse_if_replaced
+from shmmap.installed import OURS, refuse_if_replaced
 from shmmap.segment.process_limits import no_files_left
 
 __all__ = [
@@ -49,8 +49,6 @@ _OPTIONAL: Final = frozenset(
 )
 """Packages that an ordinary installation lacks: `project.optional-dependencies`."""
 
-_OURS: Final = ("shmmap", "shmmap_clients")
-
 _names: dict[str, dict[str, str]] = {}
 """Module of each public name, by package; empty until the package's source has been read."""
 
@@ -80,7 +78,7 @@ def needed_packages(what: str, *, together: str = "") -> Iterator[None]:
         yield
     except ModuleNotFoundError as error:
         module = (error.name or "").partition(".")[0]
-        if not module or module in _OURS:
+        if not module or module in OURS:
             raise
         package = _PACKAGES.get(module, module)
         all_others = (

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-import platform
+import os
 from typing import Any, Final
 
 from shmmap.errors import PackageMissing, ShmmapError
@@ -12,7 +12,7 @@ __all__ = ["SYSTEM_PACKAGES", "load_open3d"]
 
 SYSTEM_PACKAGES: Final = (
     "libegl1", "libgl1", "libx11-6", "libusb-1.0-0", "libgomp1",
-    *(() if platform.machine() == "x86_64" else ("libgfortran5",)),  # Open3D for other machines links to it
+    *(() if os.uname().machine == "x86_64" else ("libgfortran5",)),  # Open3D for other machines links to it
 )  # fmt: skip
 """Packages of Debian and Ubuntu that Open3D needs on a machine without a desktop."""
 
@@ -35,7 +35,7 @@ def load_open3d(purpose: str) -> Any:
     try:
         import open3d
     except ModuleNotFoundError as error:
-        cpu_only = "open3d-cpu" if platform.machine() == "x86_64" else "open3d"  # as in pyproject.toml
+        cpu_only = "open3d-cpu" if os.uname().machine == "x86_64" else "open3d"  # as in pyproject.toml
         package = cpu_only if error.name == "open3d" else error.name
         raise PackageMissing(
             f"{purpose} needs the Python package Open3D, which is not installed"

@@ -44,7 +44,7 @@ def prepare_on(client: Client, url: str, layers: list[str], slices: int) -> str:
         client.submit(prepare_slice, url, layers, number, slices, retries=2, pure=False)
         for number in range(1, slices + 1)
     ]
-    print(f"{slices} slices are made; each is reported when it is done", flush=True)
+    print(f"making {slices} slices; each is reported when it is done", flush=True)
     runs = set()
     for done, (future, made) in enumerate(as_completed(futures, with_results=True), 1):
         runs.add(made["run"])

@@ -7,11 +7,15 @@ import contextlib
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import TYPE_CHECKING, Final
+
+from shmmap.errors import ShmmapError
 
 if TYPE_CHECKING:
     from shmmap.client.client import Client
+    from shmmap.statistics.reader import Snapshot
 
 __all__ = ["CompilingLines", "saying_what_the_daemon_compiles"]
 
@@ -43,8 +47,11 @@ class CompilingLines:
 @contextlib.contextmanager
 def saying_what_the_daemon_compiles(client: Client) -> Iterator[None]:
     """Print a line if the daemon compiles kernels while the block waits for layers."""
+    from shmmap.statistics.reader import read_statistics
+
     ended = threading.Event()
-    thread = threading.Thread(target=_look, args=(client, ended), daemon=True)
+    where = client.welcome.instance, client.welcome.shm_dir
+    thread = threading.Thread(target=_look, args=(partial(read_statistics, *where), ended), daemon=True)
     thread.start()
     try:
         yield
@@ -53,13 +60,10 @@ def saying_what_the_daemon_compiles(client: Client) -> Iterator[None]:
         thread.join()
 
 
-def _look(client: Client, ended: threading.Event) -> None:
-    from shmmap.errors import ShmmapError
-    from shmmap.statistics.reader import read_statistics
-
+def _look(read: Callable[[], Snapshot], ended: threading.Event) -> None:
     while not ended.wait(_LOOK_S):
         try:
-            found = read_statistics(client.welcome.instance, client.welcome.shm_dir)
+            found = read()
         except (ShmmapError, OSError):
             return
         if found.counters.get("loaders_compiling", 0):

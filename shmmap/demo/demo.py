@@ -139,7 +139,7 @@ def run_demo(settings: DemoSettings, progress: Progress, *, map_dir: str | None 
         makers = [] if missing else prepare(settings, work, stack)
         town = build_town(settings, map_dir, progress)
         if makers:
-            progress.stage("Simulating LiDAR scans, compiling kernels (once for this version)", 1)
+            progress.stage("Simulating LiDAR scans, compiling kernels", 1)
             wait_prepared(makers)
             progress.step()
         route = town.route + town.onward

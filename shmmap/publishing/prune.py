@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Removes versions that have not been current for a long time, and objects that no version has.
 
-Entries of old versions are removed first, and metadata that signed them.
-Then the entries are listed again, and only old objects that none
-of the remaining versions has are removed.  So versions that are published, restored or read meanwhile keep
-their objects.  Equally old parts of slices were never joined, and are removed as well.
+Entries of old versions are removed first, and metadata that signed them.  Then the entries are listed again,
+and only old objects that none of the remaining versions has are removed.  So versions that are published,
+restored or read meanwhile keep their objects.  Equally old parts of slices were never joined, and are removed
+as well.
 """
 
 from __future__ import annotations

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import importlib
 import json
 import pickle
 import sys
@@ -100,7 +101,7 @@ CLIENT: Calls = {
 CELL: Calls = {
     "unit": [lambda c: c.unit("x"), lambda c: c.unit("none")],
     "to_torch": [],  # of other packages
-    "to_open3d": [],
+    "to_open3d": [lambda _: importlib.import_module("shmmap.open3d_loading")],  # not Open3D itself
 }
 CELLS: Calls = {"count": [lambda c: c.count(c[0])], "index": [lambda c: c.index(c[0])]}
 WINDOW: Calls = {

@@ -83,8 +83,7 @@ PARTS = {
     "dividing": BASE | {"formats", "layers", "origin"},
     "client": {
         "errors", "columns", "failpoints", "geometry", "installed", "lacking", "lazy_imports", "chunks",
-        "mounts", "segment", "protocol", "statistics.layout",
-        "open3d_loading",
+        "mounts", "open3d_loading", "segment", "protocol", "statistics.layout",
     },
     "daemon": BASE | {
         "chunks", "formats", "segment", "protocol", "statistics", "layers", "origin", "dividing",

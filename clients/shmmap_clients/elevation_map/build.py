@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from shmmap import BadRequest, Cell, CellError, CellInfo, Client, LoadTimeout, MapListing, ShmmapError
 from shmmap.errors import InstanceBusy, MapMissing
 from shmmap.formats.npz_writer import write_npz
-from shmmap.private_directory import require_private
+from shmmap.private_directory import open_own, require_private
 from shmmap_clients.elevation_map import surface
 from shmmap_clients.elevation_map.grid import ElevationGrid
 from shmmap_clients.elevation_map.heights import ElevationRule
@@ -310,8 +310,7 @@ def build_elevation_map(
 def _alone(cache: Path, key: str) -> Iterator[Path]:
     """Lock a directory of the cache, since concurrent runs would overwrite each other's heights."""
     require_private(cache / key)
-    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
-    with open(os.open(cache / f"{key}.lock", flags, 0o600), "r+b") as file:
+    with open(open_own(str(cache / f"{key}.lock"), os.O_RDWR | os.O_CREAT), "r+b") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

@@ -30,8 +30,8 @@ its next start (a restart sends it first, then SIGTERM as usual; in a container:
 SIGHUP reads the map again; where the daemon was started at a terminal it stops it, as when that is closed
 (not under nohup or a service manager).
 Exit code: 0 after a signal, 65 bad map, or one that --trust refuses, 66 no map there, 69 a package is
-missing, 71 a required resource is unavailable, or a published map that was never taken is out of
-reach, 75 the instance runs already, 78 bad setting."""
+missing, or shmmap was replaced under a service, 71 a required resource is unavailable, or a published map
+that was never taken is out of reach, 75 the instance runs already, 78 bad setting."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
