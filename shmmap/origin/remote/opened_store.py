@@ -225,7 +225,7 @@ class DirectoryStore:
 
     @contextmanager
     def _folder(self, path: str, *, make: bool = False) -> Iterator[int]:
-        """Open the folder of a file, which is exchanged by nobody then, and make what is missing of it."""
+        """Open the folder of a file, whatever has its name afterwards; make what is missing of it."""
         fd = os.open(self._root, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:
             *parts, _ = filter(None, path.split("/"))

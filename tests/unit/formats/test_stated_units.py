@@ -271,3 +271,27 @@ def test_columns_of_a_named_table_are_found_and_kept(tmp_path: Path) -> None:
     with pytest.raises(MapDataError) as caught:
         read_cloud(path)
     assert "leave" not in caught.value.hint
+
+
+@pytest.mark.parametrize(
+    ("header", "unit", "note"),
+    [
+        (
+            "x [mm],y [mm],z [mm]",
+            "ft",
+            "international feet (0.3048 m), although the file says: x, y and z are in mil",
+        ),
+        ("x [mm],y [mm],z [mm]", "auto", "converted to metres: x, y and z are in millimetres (0.001 m)"),
+        ("x,y,z", "ft", "converted to metres: x, y and z are in international feet (0.3048 m)"),
+    ],
+)
+def test_a_unit_that_differs_from_the_stated_one_is_noted(
+    tmp_path: Path, header: str, unit: str, note: str
+) -> None:
+    (tmp_path / "a.csv").write_text(header + "\n1,2,3\n4,5,6\n")
+    settings = DivideSettings(unit=unit, drop_noise=True, durable=False)
+    notes = divide([tmp_path / "a.csv"], tmp_path / "map", settings).notes
+    (converted,) = (one for one in notes if one.startswith("converted"))
+    assert note in converted
+    assert ("although" in converted) == ("although" in note)
+    assert any("a.csv: --drop-noise had no effect" in one for one in notes)
