@@ -22,6 +22,7 @@ __all__ = [
     "PRIVATE",
     "UNWRITABLE",
     "NotPrivate",
+    "open_followed",
     "open_own",
     "open_private",
     "opened_private",
@@ -197,6 +198,11 @@ def require_private(path: str | os.PathLike[str], *, make: int = PRIVATE, refuse
             why := why_not_own(status, status.st_uid, refused=stat.S_IWOTH)
         ):
             raise NotPrivate(above, why)
+
+
+def open_followed(path: str) -> int:
+    """Open a directory, also through a link that this user or root has made; OSError for another's link."""
+    return os.open(_followed(path), DIRECTORY_FLAGS)
 
 
 def _followed(path: str | os.PathLike[str]) -> str:

@@ -34,7 +34,7 @@ from shmmap.errors import BadRequest, MapDataError
 from shmmap.formats.coordinate_system import GEOGRAPHIC_SYSTEM, degrees_warning
 from shmmap.formats.durable_file import writing_errors
 from shmmap.formats.pcd.reader import PcdReader
-from shmmap.formats.point_checks import step_warning
+from shmmap.formats.point_checks import LasChecks, step_warning
 from shmmap.formats.source_file import refusal
 from shmmap.origin.map_report import DividedMap, far_cells_notes, write_report
 from shmmap.progress import NoProgress, Progress
@@ -311,6 +311,8 @@ class _Run:
         notes = [*self._units.notes, *self._frame.notes]
         for source in self._sources:
             notes += [f"{source.path}: {note}" for note in (*source.warnings, *source.checks.notes())]
+        if self._settings.drop_noise:
+            notes += self._not_classified()
         notes += self._steps(read.extremes)
         if not any(GEOGRAPHIC_SYSTEM in note for note in notes):
             low, high = read.extremes + self._frame.origin
@@ -348,6 +350,12 @@ class _Run:
             crs=self._units.crs,
             unit_m=self._units.unit_m,
         )
+
+    def _not_classified(self) -> list[str]:
+        """Return a note about inputs of formats that do not mark noise."""
+        others = [source.path for source in self._sources if not isinstance(source.checks, LasChecks)]
+        where = others[0] if len(others) == 1 else f"{len(others)} inputs"
+        return [f"{where}: --drop-noise had no effect, as only LAS and LAZ mark noise"] if others else []
 
     def _steps(self, extremes: NDArray[np.float64]) -> list[str]:
         """Return a note if the inputs' coordinates are float32, and too large for it."""

@@ -289,7 +289,9 @@ def _scale(source: Source, unit: str, vertical_unit: str, notes: list[str]) -> t
     if (not unit and plane != METRE) or (not unit and not vertical_unit and height != METRE):
         raise _not_metres(source.path, plane, height)
     if (plane, height) != (METRE, METRE):
-        notes.append(f"converted to metres: {units_text(plane, height)}")
+        stated = (crs.plane or crs.height) is not None and (plane, height) != said
+        other = f", although the file says: {units_text(*said)}" if stated else ""
+        notes.append(f"converted to metres: {units_text(plane, height)}{other}")
     elif crs.geographic:
         notes.append(f"taken as metres, although the file says: {GEOGRAPHIC_SYSTEM}")
     elif said != (METRE, METRE):

@@ -27,6 +27,7 @@ from shmmap.dividing.sources import (
 from shmmap.errors import BadRequest, MapDataError
 from shmmap.formats.durable_file import appearing_file, writing_errors
 from shmmap.formats.pcd.writer import pcd_header, pcd_rows
+from shmmap.formats.point_checks import LasChecks
 from shmmap.origin.map_report import read_report
 from shmmap.progress import NoProgress, Progress
 
@@ -42,7 +43,10 @@ _Move = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class MergedCloud:
-    """Result of `merge`; ``origin`` is the offset added to the points of each map that has one."""
+    """Result of `merge`; ``origin`` is the offset added to the points of each map that has one.
+
+    ``notes`` are remarks about the inputs for the user.
+    """
 
     path: str
     points: int
@@ -50,6 +54,7 @@ class MergedCloud:
     files: int
     fields: list[tuple[str, str]]
     origin: dict[str, list[float]] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
 
 
 def merge(
@@ -65,7 +70,8 @@ def merge(
     """Write all points of ``inputs`` to one PCD file, which appears complete or not at all.
 
     Points of a map that `divide` moved are moved back, in float64, unless ``keep_frame``; all other values
-    keep their bits.  Points are in the order of their files, and files in the order of their paths.
+    keep their bits.  Points of LAS that are flagged withheld are left out.  Points are in the order of their
+    files, and files in the order of their paths.
 
     Parameters
     ----------
@@ -98,7 +104,7 @@ def merge(
                     file.path, memory_bytes=memory_left(_MEMORY_BYTES) // 2, scratch_dir=os.path.dirname(out)
                 )
                 stack.callback(source.close)
-                choose_units([source], "", "")  # refuses feet, which a PCD file cannot declare
+                _check_metres(source)
                 opened.append((file, source, moves[path]))
         if not opened:
             raise BadRequest("nothing to merge")
@@ -118,17 +124,29 @@ def merge(
         progress.stage("merging", points)
         with appearing_file(out) as target:
             target.write(header)
+            written = 0
             for _, source, move in opened:
-                _append(target, source, RowLayout(row, move), encoding, progress)
+                written += _append(target, source, RowLayout(row, move), encoding, progress)
+            if not written:
+                raise MapDataError("all points of the inputs are left out", cause="no_points")
+            if written < points:
+                target.seek(0)
+                target.write(pcd_header(pcd_fields(row), written, encoding, header_bytes=len(header)))
             check_unchanged([file for file, _, _ in opened])
         progress.done(points)
+        notes = [
+            f"{source.path}: {note}"
+            for source in sources
+            for note in (*source.warnings, *source.checks.notes())
+        ]
     return MergedCloud(
         path=out,
-        points=points,
+        points=written,
         bytes=os.stat(out).st_size,
         files=len(sources),
         fields=field_types(row),
         origin=origins,
+        notes=notes,
     )
 
 
@@ -148,13 +166,29 @@ def _origin_of(path: str) -> _Move:
     return x, y, z
 
 
-def _append(file: IO[bytes], source: Source, layout: RowLayout, encoding: str, progress: Progress) -> None:
+def _check_metres(source: Source) -> None:
+    """Refuse coordinates in another unit, which a PCD file cannot declare."""
+    try:
+        choose_units([source], "", "")
+    except MapDataError as error:
+        if error.cause == "not_metres":
+            error.hint = "`shmmap divide --unit` converts them or says what they are; merge the map it makes"
+        raise
+
+
+def _append(file: IO[bytes], source: Source, layout: RowLayout, encoding: str, progress: Progress) -> int:
+    """Append the points of a source, and return their number without those that LAS marks to leave out."""
     rows = np.empty(max(1, min(source.points, _BLOCK_BYTES // layout.row.itemsize)), layout.row)
     source.begin(layout, 0)
-    left = source.points
+    left, written = source.points, 0
     while left:
         count = source.read(rows[:left])
-        file.write(pcd_rows(rows[:count], encoding))
+        kept = rows[:count]
+        if isinstance(source.checks, LasChecks):
+            kept = kept[~np.isnan(kept["x"])]
+        file.write(pcd_rows(kept, encoding))
+        written += len(kept)
         left -= count
         progress.advance(count)
     source.close()  # a map has more cells than a process may have open files
+    return written

@@ -193,6 +193,7 @@ def read_cloud(
         Keep points whose x, y or z is not finite; points that are left out for another reason are NaN then.
     drop_noise
         Leave out points that LAS classifies as noise (classes 7 and 18), as those that are flagged withheld.
+        Other formats do not mark noise: it has no effect on them.
 
     Raises
     ------

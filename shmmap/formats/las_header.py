@@ -40,6 +40,24 @@ _LASZIP: Final = (b"laszip encoded", 22204)
 _EXTRA_BYTES: Final = (b"LASF_Spec", 4)
 _DIMENSION_BYTES: Final = 192  # one dimension in the Extra Bytes record
 _TYPE_BYTES: Final = (1, 1, 2, 2, 4, 4, 8, 8, 4, 8)  # of types 1 to 10; 11 to 20 are pairs, 21 to 30 triples
+_TYPES: Final = 30
+_NAMES: Final = (
+    "X Y Z x y z intensity return_number number_of_returns scan_direction_flag edge_of_flight_line"
+    " classification synthetic key_point withheld user_data point_source_id"
+)
+_BEFORE_6: Final = "scan_angle_rank"
+_SINCE_6: Final = "scan_angle overlap scanner_channel gps_time"
+_SOME: Final = {
+    (1, 3, 4, 5): "gps_time",
+    (2, 3, 5, 7, 8, 10): "red green blue",
+    (8, 10): "nir",
+    (
+        4,
+        5,
+        9,
+        10,
+    ): "wavepacket_index wavepacket_offset wavepacket_size return_point_wave_location x_t y_t z_t",
+}
 _MAX_RECORDS: Final = 10_000
 _MAX_RECORD_BYTES: Final = 1 << 20
 _MAX_CHUNKS: Final = (
@@ -128,6 +146,9 @@ class _Header:
             waveforms, extended_at, extended, long = _LONG.unpack_from(head, 227)
         if header_bytes < _SHORTEST_BYTES:
             raise self._error("bad_las", f"a header of {header_bytes} bytes announced", 94)
+        if data_at < header_bytes:
+            message = f"its points begin at byte {data_at}, within its header of {header_bytes} bytes"
+            raise self._error("bad_las", message, 96)
         self._check_scales()
         points = self._count(legacy, long, form)
         compressed = bool(form & _LAZ_BIT)
@@ -269,24 +290,37 @@ class _Header:
                     return
 
     def _dimensions(self, described: bytes, point_format: int, record_bytes: int) -> bytes:
-        """Return the part of an Extra Bytes record whose dimensions the points have; note the others."""
+        """Return an Extra Bytes record of what the points have, each name once; note the others."""
         room = record_bytes - standard_bytes(point_format)
-        used, names, end = 0, [], 0
+        used, end, left_out = 0, 0, []
+        usable, names = bytearray(), _standard_names(point_format)
         for at in range(0, len(described) - _DIMENSION_BYTES + 1, _DIMENSION_BYTES):
-            kind, size = described[at + 2 : at + 4]
-            if 1 <= kind <= 30:
+            one = described[at : at + _DIMENSION_BYTES]
+            name, renamed = _dimension_name(one, names)
+            kind, size = one[2:4]
+            if 1 <= kind <= _TYPES:
                 size = _TYPE_BYTES[(kind - 1) % 10] * (1 + (kind - 1) // 10)
             used += size
-            if used > room:
-                names.append(described[at + 4 : at + 36].split(b"\0")[0].decode("utf-8", "replace"))
-            else:
-                end = at + _DIMENSION_BYTES
-        if names:
+            if kind > _TYPES or used > room:
+                used = max(used, room + 1)  # where the next one begins is not known either
+                left_out.append(name)
+            elif size:
+                end = used
+                names.add(name)
+                usable += one[:4] + name.encode().ljust(32, b"\0") + one[36:]
+                if renamed:
+                    self.warnings.append(f"an extra dimension has no name of its own: it is {name!r} here")
+        if left_out:
             self.warnings.append(
-                f"its Extra Bytes record describes {used} bytes, its points have {max(0, room)}: without"
-                f" {', '.join(map(repr, names[:_SHOWN]))}" + (", ..." if len(names) > _SHOWN else "")
+                f"its Extra Bytes record does not fit the {max(0, room)} extra bytes of its points: without"
+                f" {', '.join(map(repr, left_out[:_SHOWN]))}" + (", ..." if len(left_out) > _SHOWN else "")
             )
-        return described[:end]
+        elif described and end < room:
+            self.warnings.append(
+                f"its Extra Bytes record describes {end} bytes, its points have {room}: the extra"
+                " dimensions may be wrong"
+            )
+        return bytes(usable)
 
     def _head_with(self, header_bytes: int, records: dict[tuple[bytes, int], bytes]) -> bytes:
         """Return the header with these records and no others."""
@@ -318,3 +352,22 @@ class _Header:
             used = "WKT" if means_text else "latter"
             self.warnings.append(f"its WKT and its GeoTIFF keys have different units: the {used} is used")
         return chosen
+
+
+def _standard_names(point_format: int) -> set[str]:
+    """Return the names of a point format's own dimensions."""
+    names = {*_NAMES.split(), *(_SINCE_6 if point_format >= _LEGACY_FORMATS else _BEFORE_6).split()}
+    for formats, more in _SOME.items():
+        names.update(more.split() if point_format in formats else ())
+    return names
+
+
+def _dimension_name(described: bytes, taken: set[str]) -> tuple[str, bool]:
+    """Return a dimension's name, and whether it had to be changed: it was empty, no text or taken."""
+    text = described[4:36].split(b"\0")[0].decode("utf-8", "replace").replace("\ufffd", "_").strip()
+    base = text or "extra"
+    name, number = base, 1
+    while name in taken or len(name.encode()) > 32:
+        number += 1
+        name = f"{base[:24]}_{number}"
+    return name, name != described[4:36].split(b"\0")[0].decode("utf-8", "replace")

@@ -8,11 +8,10 @@ What looks like a unit and is none is reported, not guessed at.
 
 from __future__ import annotations
 
-import itertools
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeAlias
 
 from shmmap.formats.coordinate_system import LENGTHS, METRE, CoordinateSystem, LengthUnit
 
@@ -21,6 +20,7 @@ __all__ = [
     "coordinates_of",
     "decoded",
     "named_unit",
+    "split_names",
     "system_of_comments",
     "units_in_comments",
     "units_row",
@@ -62,6 +62,9 @@ _NAMES: Final[dict[str, LengthUnit]] = {
     "sft": _US,
 }
 _BRACKET: Final = re.compile(r"(.*?[^\s])\s*[\[({<](.*?)[\])}>]?$")
+_UNIT: Final = re.compile(r"\s*[\[({<][^\[\](){}<>]*[\])}>]")
+_GLUED: Final = re.compile(r"([xyz])([a-zµμ]{2,})")
+_SAID: Final = re.compile(r"^\s*(?:(?:all )?in\s+|units?\s*[:=]\s*)")
 _BETWEEN: Final = re.compile(r"\s+in\s+|[\s/_:.\-]+")
 
 
@@ -75,7 +78,13 @@ def decoded(text: bytes) -> str:
 
 def named_unit(text: str) -> LengthUnit | None:
     """Return the unit that a text is the name of; None if it is none."""
-    return _NAMES.get(re.sub(r"[\s_.()\-]+", "", text.lower().removeprefix("in ")))
+    return _NAMES.get(re.sub(r"[\s_.()\-]+", "", _SAID.sub("", text.lower())))
+
+
+def split_names(text: str) -> list[str]:
+    """Return the words of a line of names; units in brackets may have spaces in and before them."""
+    joined = _UNIT.sub(lambda found: re.sub(r"[\s,;]+", "", found.group()), text)
+    return re.split(r"[\s,;]+", joined.strip())
 
 
 # --- names of columns -----------------------------------------------------------------------------------
@@ -134,6 +143,8 @@ def _taken_apart(name: str) -> list[_Name]:
         if unit := named_unit(text[between.end() :]):
             ways.append(_Name(_common(text[: between.start()]), unit))
             break
+    if (glued := _GLUED.fullmatch(text)) and (unit := named_unit(glued.group(2))):
+        ways.append(_Name(glued.group(1), unit))
     return ways
 
 
@@ -244,17 +255,24 @@ def units_row(words: Sequence[str]) -> list[LengthUnit | None] | None:
 
 # --- comments -------------------------------------------------------------------------------------------
 
+_HEIGHT: Final = r"z|heights?|elevations?|altitudes?|vertical"
 _QUANTITY: Final = (
-    r"(?:(?:the|all|of|for|linear|length|distance|measurement|measure|map|file|data|world|scale|xyz|horizontal"
-    r"|vertical|values?|dimensions?|coordinates?|coords?|points?|positions?|vert(?:ex|ices)"
-    r"|x[ ,]*y[ ,]*(?:and )?z)[\s_]*)"
+    r"(?:(?:the|all|of|for|linear|length|distance|measurements?|measure|map|file|data|world|scale|xyz|horizontal"
+    r"|values?|dimensions?|coordinates?|coords?|points?|positions?|vert(?:ex|ices)|(?:point[\s_]*)?clouds?|scans?"
+    rf"|x[ ,]*y[ ,]*(?:and )?z|{_HEIGHT})(?![a-z])[\s_\-]*|(?:length|linear|distance|coordinate)(?=unit))"
 )
-_VERB: Final = r"(?:(?:are|is|all|used|given|stored|measured|expressed|recorded)\s+)*"
-_STATED: Final = (
-    re.compile(rf"\W*(?P<what>{_QUANTITY}*)units?\s*{_QUANTITY}*{_VERB}(?:in\s+)?[\s:=,\[(\"']*(?P<unit>.*)"),
-    re.compile(rf"\W*(?P<what>{_QUANTITY}+){_VERB}(?:in\b|[\[(])[\s:]*(?P<unit>.*)"),
+_VERB: Final = r"(?:(?:are|is|all|used|given|stored|saved|written|exported|measured|expressed|recorded)\s+)*"
+_OPEN: Final = r"[\s:=,\[(\"']*"
+_BY_UNIT: Final = re.compile(
+    rf"\W*(?:1\s+)?(?P<what>{_QUANTITY}*)units?[\s_\-]*{_QUANTITY}*{_VERB}(?:in\s+)?{_OPEN}(?P<unit>.*)"
 )
+_BY_IN: Final = re.compile(rf"\W*(?P<what>{_QUANTITY}*){_VERB}(?:in\b|[\[(])[\s:]*(?P<unit>.*)")
+_BY_COLON: Final = re.compile(rf"\W*(?P<what>{_QUANTITY}+){_VERB}{_OPEN}(?P<unit>.*)")
 _UNIT_WORDS: Final = re.compile(r"[a-zµμ\"'°]+(?:[ _\-]+[a-z]+){0,3}")
+_NUMBER: Final = re.compile(r"([0-9]*\.?[0-9]+(?:e[+-]?[0-9]+)?)\s*(?=[a-zµμ])")
+_CLOSING: Final = " .;:!\"'()[]{}<>"
+
+Units: TypeAlias = tuple[LengthUnit, LengthUnit] | None
 
 
 def units_in_comments(comments: Iterable[str]) -> tuple[LengthUnit | None, LengthUnit | None]:
@@ -263,24 +281,71 @@ def units_in_comments(comments: Iterable[str]) -> tuple[LengthUnit | None, Lengt
     Comments that contradict each other give a unit of unknown length.
     """
     stated: tuple[list[LengthUnit], list[LengthUnit]] = ([], [])
-    clauses = (clause for text in comments for clause in dict.fromkeys((text, *re.split(r"[,;.]\s", text))))
-    for clause, pattern in itertools.product(clauses, _STATED):
-        found = pattern.match(clause.lower())
-        if found and (unit := _first_unit(found["unit"])):
-            if "vertical" not in found["what"]:
-                stated[0].append(unit)
-            if "horizontal" not in found["what"]:
-                stated[1].append(unit)
+    for text in comments:
+        named = coordinates_of(split_names(text))
+        if named and named.crs and not named.crs.geographic and _UNSTATED not in named.crs.units:
+            for units, unit in zip(stated, named.crs.units, strict=True):
+                units.append(unit)
+        for clause in dict.fromkeys((text, *re.split(r"[,;.]\s", text))):
+            for what, plane, height in _stated_by(clause.lower(), whole=clause is text):
+                is_height = re.search(rf"(?<![a-z])(?:{_HEIGHT})(?![a-z])", what)
+                if not is_height or re.search(r"x[ ,]*y", what):
+                    stated[0].append(plane)
+                if "horizontal" not in what:
+                    stated[1].append(height)
     return _only(stated[0]), _only(stated[1])
+
+
+def _stated_by(clause: str, *, whole: bool) -> Iterator[tuple[str, LengthUnit, LengthUnit]]:
+    """Yield what a clause is about, and the units of plane and height that it states."""
+    if found := _BY_UNIT.match(clause):
+        if units := _three(found["unit"]) or _multiple(found["unit"]) or _first(found["unit"]):
+            yield found["what"], *units
+    elif (found := _BY_IN.match(clause)) and (units := _first(found["unit"])):
+        yield found["what"], *units
+    elif (found := _BY_COLON.match(clause)) and (unit := _whole_unit(found["unit"])):
+        yield found["what"], unit, unit
+    elif whole and (unit := _whole_unit(clause)):
+        yield "", unit, unit
+
+
+def _whole_unit(text: str) -> LengthUnit | None:
+    """Return the unit that a text is, and nothing else."""
+    return named_unit(text.strip(_CLOSING))
+
+
+def _three(text: str) -> Units:
+    """Return the units of plane and height from three, one for each axis."""
+    axes = [unit for word in re.split(r"[\s,;]+", text.strip(_CLOSING)) if (unit := _whole_unit(word))]
+    return (axes[0] if axes[0] == axes[1] else _UNSTATED, axes[2]) if len(axes) == 3 else None
+
+
+def _multiple(text: str) -> Units:
+    """Return the unit, for plane and height, that is a number of another."""
+    number = _NUMBER.match(text)
+    unit = _whole_unit(text[number.end() :]) if number else None
+    if number is None or unit is None or not unit.metres:
+        return None
+    factor = float(number.group(1))
+    made = unit if factor == 1 else LengthUnit(f"units of {factor:g} {unit.name}", factor * unit.metres)
+    return made, made
+
+
+def _first(text: str) -> Units:
+    """Return the unit, for plane and height, that a text begins with."""
+    unit = _first_unit(text)
+    return (unit, unit) if unit else None
 
 
 def _first_unit(text: str) -> LengthUnit | None:
     """Return the unit that a text begins with."""
     found = _UNIT_WORDS.match(text)
     words = re.split(r"[ _\-]+", found.group()) if found else []
-    return next(
-        (unit for end in range(len(words), 0, -1) if (unit := named_unit("".join(words[:end])))), None
-    )
+    for end in range(len(words), 0, -1):
+        joined = "".join(words[:end])
+        if unit := named_unit(joined) or named_unit(joined.rstrip("\"'")):
+            return unit
+    return None
 
 
 def _only(units: Sequence[LengthUnit]) -> LengthUnit | None:

@@ -27,6 +27,7 @@ from shmmap.formats.source_file import FileReader, refusal
 from shmmap.formats.stated_units import (
     coordinates_of,
     decoded,
+    split_names,
     system_of_comments,
     units_in_comments,
     units_row,
@@ -42,7 +43,6 @@ TABLE_SUFFIXES: Final = (".txt", ".csv", ".asc")
 _HEAD_BYTES: Final = 1 << 16  # the first point must begin within this
 _COMMENT: Final = re.compile(rb"(?m)^[ \t]*(?:#|//|%)[^\r\n]*")
 _NO_ROW: Final = re.compile(rb"(?m)^[ \t\r\v\f]*(?:$|#|//|%)")
-_UNIT: Final = re.compile(r"\s*[\[({<][^\[\](){}<>]*[\])}>]")
 _NORMALS: Final = ("nx", "ny", "nz")
 _COLOURS: Final = ("red", "green", "blue")
 _UNNAMED: Final = {1: ("intensity",), 3: _COLOURS, 4: ("intensity", *_COLOURS)}
@@ -365,8 +365,7 @@ def _are_normals(rows: NDArray[np.float64]) -> bool:
 def _splits(text: str, separator: str, count: int) -> Iterator[list[str]]:
     """Yield the ways to split a line into ``count`` names; units in brackets may have spaces around them."""
     marks = [mark for mark in dict.fromkeys((separator, "\t", ",", ";")) if mark and mark in text]
-    joined = _UNIT.sub(lambda found: re.sub(r"[\s,;]+", "", found.group()), text)
-    for words in (*(text.split(mark) for mark in marks), re.split(r"[\s,;]+", joined.strip())):
+    for words in (*(text.split(mark) for mark in marks), split_names(text)):
         if len(words) == count + 1 and not words[-1].strip():
             words.pop()
         if len(words) == count:

@@ -234,6 +234,7 @@ def _joined(
         problems.append(f"{metadata}: files without an entry, not served: {listed}")
     if len(names) > len(entries.names) - int(lacks_file.sum()):
         problems.append("some base names stand for several files, all served with the same box")
+    problems += _unit_problems(files.prefix + os.fsdecode(bytes(names[0])))
     sides = np.empty((4, len(entry)))
     sides[:2] = entries.corners[entry].T
     sides[2:] = sides[:2] + np.array([[entries.x_resolution], [entries.y_resolution]])
@@ -245,6 +246,15 @@ def _joined(
         stamps=stamps,
         problems=problems,
     )
+
+
+def _unit_problems(path: str) -> list[str]:
+    """Return what one cell's header says about units; the cells of a map are written by one program."""
+    try:
+        with PcdReader(path) as reader:
+            return [f"{path}: {warning}" for warning in unit_warnings(reader.header.crs)]
+    except (OSError, MapDataError):
+        return []  # loading it reports what is wrong
 
 
 def _matched(
@@ -319,7 +329,8 @@ def load_single_pcd(path: str) -> Catalogue:
     if not np.isfinite(lower).all():
         raise MapDataError("no finite point, so the map has no extent", path=path, cause="no_points")
     box = (float(lower[0]), float(lower[1]), float(upper[0]), float(upper[1]))
-    warnings = (degrees_warning(lower, upper), step_warning(lower, upper, reader.columns[0].dtype))
+    units = unit_warnings(reader.header.crs)
+    warnings = (*units, degrees_warning(lower, upper), step_warning(lower, upper, reader.columns[0].dtype))
     problems = [f"{path}: {warning}" for warning in warnings if warning]
     return Catalogue.from_cells([(path, box, SourceStamp.of(status))], problems=problems)
 

@@ -11,6 +11,7 @@ import pytest
 
 from shmmap.dividing.workspace import Workspace
 from shmmap.errors import CannotWrite, InstanceBusy
+from shmmap.origin.remote.opened_store import DirectoryStore
 from shmmap.origin.remote.taken_version import TakenVersion, TakenVersionFile
 from shmmap.private_directory import (
     CLOSED,
@@ -206,3 +207,32 @@ def test_a_run_beside_another_is_busy_and_errors_name_the_directory(tmp_path: Pa
     with pytest.raises(OSError, match=r"\.map\.dividing/none") as wrong, Workspace(str(tmp_path / "map")):
         (Path(path) / "none").read_text()
     assert wrong.value.filename == str(tmp_path / ".map.dividing" / "none")
+
+
+@pytest.mark.root
+def test_a_published_directory_with_links_of_another_account(tmp_path: Path) -> None:
+    victim = tmp_path / "victim"
+    victim.mkdir()
+    (victim / "precious").write_text("x")
+    root = tmp_path / "published"
+    root.mkdir()
+    store = DirectoryStore(str(root))
+    for name in ("blobs", "versions"):
+        (root / name).symlink_to(victim)
+    store.put("versions/1.json", b"own links are followed")
+    listed = sorted(found.path for found in store.list("blobs/"))
+    assert listed == ["blobs/1.json", "blobs/precious"]
+    store.delete("versions/1.json")
+    for name in ("blobs", "versions"):
+        os.lchown(root / name, OTHER_USER, OTHER_USER)
+    for attempt in (
+        lambda: store.put("versions/1.json", b"x"),
+        lambda: store.put_new("versions/1.json", b"x"),
+        lambda: store.delete("blobs/precious"),
+    ):
+        with pytest.raises(CannotWrite, match="another account's link"):
+            attempt()
+    assert list(store.list("blobs/")) == []
+    assert os.listdir(victim) == ["precious"]
+    store.put("new/below/a", b"x")
+    assert [found.path for found in store.list("new/")] == ["new/below/a"]

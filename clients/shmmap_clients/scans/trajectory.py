@@ -21,6 +21,7 @@ _NORM_TOLERANCE = 1e-2
 _UNITS: Final = (("seconds", 1.0), ("milliseconds", 1e-3), ("microseconds", 1e-6), ("nanoseconds", 1e-9))
 _CLOCK_S: Final = (5e8, 5e9)  # times of clocks: 1985 to 2128
 _SPARSE_S: Final = 30.0  # poses further apart are not those of a drive
+_APART: Final = 100.0  # units are 1000 apart, times of clocks far less
 _LONGEST_STEP: Final = 2.0  # of seconds
 _SHORTEST_STEP: Final = 2e3  # of microseconds: 500 poses a second
 _COUNTED: Final = 1e6  # no drive has more frames
@@ -184,6 +185,11 @@ def _in_seconds(stamps: NDArray[np.float64], name: str) -> tuple[NDArray[np.floa
     steps = np.diff(np.unique(stamps))
     step = float(np.median(steps)) if len(steps) else 0.0
     size = float(np.median(np.abs(stamps)))
+    least, most = float(np.abs(stamps).min()), float(np.abs(stamps).max())
+    if least >= _CLOCK_S[0] and most >= _APART * least:
+        raise MapDataError(
+            f"{name}: times of {least:.4g} and of {most:.4g} are in different units", cause="trajectory"
+        )
     low, high = _CLOCK_S
     clock = [one for one in _UNITS if low <= size * one[1] < high and step * one[1] <= _SPARSE_S]
     if clock:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import errno
 import os
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from hashlib import sha256
 from typing import Final, NamedTuple
 
@@ -14,6 +14,7 @@ from shmmap.errors import MapDataError, MapMissing, Offline
 from shmmap.formats.durable_file import appearing_file, locked_file, writing_errors
 from shmmap.origin.remote.store import LONG_RUN, SERVING, WEB_SCHEMES, Listed, Store, Tag, Timeouts, read_url
 from shmmap.origin.remote.zstd_frame import DAMAGED
+from shmmap.private_directory import NotPrivate, open_followed, within
 
 __all__ = [
     "DirectoryStore",
@@ -100,7 +101,8 @@ _ABSENT: Final = (errno.ENOENT, errno.ENOTDIR)
 class DirectoryStore:
     """A `shmmap.origin.remote.store.Store` of files below ``root``, an absolute path.
 
-    A file appears complete and flushed to the disk.  Conditional replacements hold a lock.
+    A file appears complete and flushed to the disk.  Conditional replacements hold a lock.  Nothing is
+    written, listed or deleted through a link below ``root`` that another account than this or root has made.
     """
 
     read_only = ""
@@ -162,6 +164,8 @@ class DirectoryStore:
 
     def list(self, prefix: str) -> Iterator[Listed]:
         """Yield all files below a folder, including half-written ones, whose names begin with a dot."""
+        if not self._is_own(prefix):
+            return
         for folder, _, names in os.walk(self._path(prefix)):
             below = os.path.relpath(folder, self._root)
             for name in names:
@@ -196,16 +200,54 @@ class DirectoryStore:
 
     def delete(self, path: str) -> None:
         """Remove a file."""
-        with writing_errors(self._path(path)), suppress(FileNotFoundError):
-            os.unlink(self._path(path))
+        full = self._path(path)
+        with writing_errors(full), suppress(FileNotFoundError), self._folder(path) as folder:
+            os.unlink(within(folder, os.path.basename(path)))
 
     def _write(self, path: str, data: bytes, *, replace: bool) -> bool:
         full = self._path(path)
         with writing_errors(full):
-            os.makedirs(os.path.dirname(full), exist_ok=True)
+            os.makedirs(self._root, exist_ok=True)
             try:
-                with appearing_file(full, replace=replace) as file:
+                with (
+                    self._folder(path, make=True) as folder,
+                    appearing_file(within(folder, os.path.basename(path)), replace=replace) as file,
+                ):
                     file.write(data)
             except FileExistsError:
                 return False
+            except NotPrivate:
+                raise
+            except OSError as error:
+                error.filename = full  # not that of the descriptor
+                raise
         return True
+
+    @contextmanager
+    def _folder(self, path: str, *, make: bool = False) -> Iterator[int]:
+        """Open the folder of a file, whatever has its name afterwards; make what is missing of it."""
+        fd = os.open(self._root, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            *parts, _ = filter(None, path.split("/"))
+            for depth, part in enumerate(parts):
+                if make:
+                    with suppress(FileExistsError):
+                        os.mkdir(part, dir_fd=fd)
+                try:
+                    below = open_followed(within(fd, part))
+                except NotADirectoryError:
+                    place = os.path.join(self._root, *parts[: depth + 1])
+                    raise NotPrivate(place, "is no directory, or another account's link") from None
+                os.close(fd)
+                fd = below
+            yield fd
+        finally:
+            os.close(fd)
+
+    def _is_own(self, folder: str) -> bool:
+        """Whether a folder is there, and no link of another account leads there."""
+        try:
+            with self._folder(f"{folder}/x"):
+                return True
+        except OSError:
+            return False

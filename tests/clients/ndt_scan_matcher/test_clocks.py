@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from shmmap_clients.ndt_scan_matcher import matrix_from_pose
+from shmmap_clients.ndt_scan_matcher.cli.follow import not_covered
 from shmmap_clients.ndt_scan_matcher.drive import pose_stream
 from shmmap_clients.ndt_scan_matcher.drive.motion_prediction import (
     LONGEST_STEP_S,
@@ -140,3 +141,11 @@ def test_a_subscriber_drops_odometry_from_before_the_clock_was_set_back(
         assert subscriber.wait_until(0.1, 0.0)
     finally:
         subscriber.close()
+
+
+def test_odometry_of_another_clock_is_noted() -> None:
+    recorded = straight(1.6e9, 1.6e9 + 0.1, 1.6e9 + 0.2)
+    assert "no motion is known" in not_covered("odometry.tum", recorded, 0.0)
+    assert "no motion is known" in not_covered("odometry.tum", straight(0.0, 0.1), 1.6e9)
+    assert not not_covered("odometry.tum", recorded, 1.6e9 - 0.05)
+    assert not not_covered("odometry.tum", straight(0.0, 0.1), 0.0)

@@ -300,3 +300,13 @@ def test_a_subscriber_that_does_not_read_holds_up_nothing(
     with ScanSubscriber(endpoint), ScanPublisher(endpoint) as publisher:
         assert publisher.wait_for_subscriber(30.0)
         publisher.send(None)  # and closes, the reader still there
+
+
+def test_times_in_two_units_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "poses.tum"
+    for other in ("1600000000200", "1600000000200000000"):
+        path.write_text(
+            "".join(f"{stamp} 0 0 0 0 0 0 1\n" for stamp in ("1600000000", "1600000000.1", other))
+        )
+        with pytest.raises(MapDataError, match="different units"):
+            read_trajectory(path)

@@ -96,3 +96,32 @@ def test_refusals_leave_things_as_they_were(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setattr(os, "statvfs", lambda _: os.statvfs_result((*real[:3], 0, 0, *real[5:])))
     with pytest.raises(CannotWrite, match="are free"):
         merge([map_dir], tmp_path / "new.pcd")
+
+
+@pytest.mark.parametrize("encoding", ["binary", "ascii"])
+def test_withheld_points_are_left_out_and_counted(tmp_path: Path, encoding: str) -> None:
+    laspy = pytest.importorskip("laspy")
+    las = laspy.LasData(laspy.LasHeader(point_format=6, version="1.4"))
+    las.x, las.y, las.z = (np.arange(100) * 0.5 for _ in range(3))
+    las.withheld = np.arange(100) < 5
+    las.write(tmp_path / "in.las")
+    write_pcd(tmp_path / "in.pcd", {axis: np.array([1.0, np.nan]) for axis in "xyz"})
+    inputs = [tmp_path / "in.las", tmp_path / "in.pcd"]
+    made = merge(inputs, tmp_path / "out.pcd", encoding=encoding, common_fields=True)
+    found = cloud.read_cloud(tmp_path / "out.pcd", keep_non_finite=True).xyz
+    assert made.points == len(found) == 97
+    assert np.array_equal(found[:95, 0], np.arange(5, 100) * 0.5)
+    assert np.array_equal(found[95:, 0], [1.0, np.nan], equal_nan=True)
+    assert any("5 points left out: flagged withheld" in note for note in made.notes)
+    las.withheld = np.ones(100, bool)
+    las.write(tmp_path / "in.las")
+    with pytest.raises(MapDataError, match="left out"):
+        merge([tmp_path / "in.las"], tmp_path / "none.pcd")
+    assert not (tmp_path / "none.pcd").exists()
+
+
+def test_a_unit_that_is_refused_names_the_verb_that_converts_it(tmp_path: Path) -> None:
+    (tmp_path / "in.csv").write_text("x [mm],y [mm],z [mm]\n1,2,3\n4,5,6\n")
+    with pytest.raises(MapDataError, match=r"0\.001 m") as refused:
+        merge([tmp_path / "in.csv"], tmp_path / "out.pcd")
+    assert "shmmap divide --unit" in refused.value.hint

@@ -272,3 +272,52 @@ def test_extra_bytes_that_the_points_do_not_have(
         np.testing.assert_array_equal(cloud.columns[name], laspy.read(tmp_path / f"a.{suffix}")[name])
     assert lost in said(path)
     assert bool(said(path)) == bool(lost)
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+@pytest.mark.parametrize(
+    ("place", "value", "note", "column"),
+    [
+        (2, b"\x00\x00", "", "bar"),  # no bytes: it describes nothing
+        (2, b"\x63\x00", "does not fit", ""),  # a type that is not defined
+        (4, b"\xff\xfe\0", "no name of its own", "__"),
+        (4, b"X\0", "no name of its own", "X_2"),
+        (4, b"withheld\0", "no name of its own", "withheld_2"),
+        (4, b"bar\0", "no name of its own", "bar"),
+        (4, b"\0", "no name of its own", "extra"),
+        (2, b"\x01", "describes 2 bytes, its points have 9", ""),
+    ],
+)
+def test_extra_bytes_described_badly(
+    tmp_path: Path, suffix: str, place: int, value: bytes, note: str, column: str
+) -> None:
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.add_extra_dims([laspy.ExtraBytesParams("foo", "f8"), laspy.ExtraBytesParams("bar", "u1")])
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = (np.arange(10.0) for _ in range(3))
+    las.foo, las.bar = np.arange(10) + 0.5, np.arange(10)
+    path = tmp_path / f"a{suffix}"
+    las.write(path)
+    content = bytearray(path.read_bytes())
+    at = content.index(b"LASF_Spec") + 52 + place
+    content[at : at + len(value)] = value
+    path.write_bytes(content)
+    found = read_cloud(path)
+    assert np.array_equal(found.xyz[:, 0], np.arange(10.0))
+    assert note in " ".join(found.warnings)
+    assert not column or column in found.columns
+    if place == 4:
+        assert np.array_equal(found.columns[column], np.arange(10) + 0.5)
+    for name in ("withheld", "classification", "gps_time"):
+        assert not found.columns[name].any()
+
+
+def test_points_within_the_header(tmp_path: Path) -> None:
+    las = laspy.LasData(laspy.LasHeader(point_format=6, version="1.4"))
+    las.x, las.y, las.z = (np.arange(10.0) for _ in range(3))
+    las.write(tmp_path / "a.las")
+    content = bytearray((tmp_path / "a.las").read_bytes())
+    content[96:100] = (100).to_bytes(4, "little")
+    (tmp_path / "a.las").write_bytes(content)
+    with pytest.raises(MapDataError, match="within its header"):
+        read_cloud(tmp_path / "a.las")

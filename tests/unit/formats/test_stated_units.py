@@ -50,6 +50,8 @@ def header_of(names: str) -> tuple[tuple[int, int, int], tuple[float, float]] | 
         ("x [km],y [km],z [m]", 1000.0, 1.0),
         ("x [in],y_in,z (inches)", 0.0254, 0.0254),
         ("x [µm],y [μm],z [um]", 1e-6, 1e-6),
+        ("xmm,Ymm,zmm", 0.001, 0.001),
+        ("x (unit: mm),y [units=mm],z (all in mm)", 0.001, 0.001),
         ("x [m],y [m],z [m]", 1.0, 1.0),
         ("x [m],y,z", 1.0, 1.0),
         ("x [mm],y [mm],z", 0.001, 0.0),  # z may be in either: not decided
@@ -108,6 +110,25 @@ def test_names_of_coordinates(names: str, places: tuple[int, int, int] | None) -
         ("made by a tool. Units: ft. 1000 points.", FT, FT),
         ("Vertical units: ft", None, FT),
         ("horizontal unit: us-ft", US_FT, None),
+        ("mm", 0.001, 0.001),
+        ("[ft]", FT, FT),
+        ("coordinates: mm", 0.001, 0.001),
+        ("values are mm", 0.001, 0.001),
+        ("exported in mm", 0.001, 0.001),
+        ("Point cloud in millimetres", 0.001, 0.001),
+        ("x [cm] y [cm] z [m]", 0.01, 1.0),
+        ("units: m m ft", 1.0, FT),
+        ("length-unit: 'mm'", 0.001, 0.001),
+        ('{"units": "mm"}', 0.001, 0.001),
+        ("1 unit = 1 mm", 0.001, 0.001),
+        ("unit: 0.001 m", 0.001, 0.001),
+        ("z [ft]", None, FT),
+        ("heights in feet", None, FT),
+        ("elevation units: us-ft", None, US_FT),
+        ("x y z", None, None),
+        ("resolution in mm: 5", None, None),
+        ("scan 12 m high", None, None),
+        ("saved in 2 m", None, None),
         ("angle units: deg", None, None),
         ("time unit: m", None, None),
         ("units per metre: 1000", None, None),
@@ -250,3 +271,27 @@ def test_columns_of_a_named_table_are_found_and_kept(tmp_path: Path) -> None:
     with pytest.raises(MapDataError) as caught:
         read_cloud(path)
     assert "leave" not in caught.value.hint
+
+
+@pytest.mark.parametrize(
+    ("header", "unit", "note"),
+    [
+        (
+            "x [mm],y [mm],z [mm]",
+            "ft",
+            "international feet (0.3048 m), although the file says: x, y and z are in mil",
+        ),
+        ("x [mm],y [mm],z [mm]", "auto", "converted to metres: x, y and z are in millimetres (0.001 m)"),
+        ("x,y,z", "ft", "converted to metres: x, y and z are in international feet (0.3048 m)"),
+    ],
+)
+def test_a_unit_that_differs_from_the_stated_one_is_noted(
+    tmp_path: Path, header: str, unit: str, note: str
+) -> None:
+    (tmp_path / "a.csv").write_text(header + "\n1,2,3\n4,5,6\n")
+    settings = DivideSettings(unit=unit, drop_noise=True, durable=False)
+    notes = divide([tmp_path / "a.csv"], tmp_path / "map", settings).notes
+    (converted,) = (one for one in notes if one.startswith("converted"))
+    assert note in converted
+    assert ("although" in converted) == ("although" in note)
+    assert any("a.csv: --drop-noise had no effect" in one for one in notes)

@@ -383,3 +383,19 @@ def test_a_list_under_another_name_is_named(tmp_path: Path, place: str) -> None:
         open_map(cells).load()
     assert f"--metadata FILE (is it {os.path.normpath(lists)}?)" in refused.value.hint
     assert len(open_map(cells, metadata=lists).load()) == 3
+
+
+def test_cells_that_state_another_unit_are_reported(tmp_path: Path) -> None:
+    header = (
+        "# .PCD v0.7\n# units: mm\nVERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
+        "WIDTH 1\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 1\nDATA ascii\n1 2 3\n"
+    )
+    root = autoware_map(tmp_path / "divided")
+    for name in NAMES:
+        (root / "pointcloud_map.pcd" / name).write_text(header)
+    alone = tmp_path / "alone"
+    alone.mkdir()
+    (alone / "a.pcd").write_text(header)
+    for place in (root, alone):
+        (problem,) = open_map(place).load().problems
+        assert "not in metres: x, y and z are in millimetres" in problem

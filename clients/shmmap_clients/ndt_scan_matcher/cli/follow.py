@@ -52,8 +52,11 @@ if TYPE_CHECKING:
     from shmmap_clients.pose_initializer import Relocalizer
     from shmmap_clients.scan_drive import ScanDrive
     from shmmap_clients.scans.scan_sequence import Scan
+    from shmmap_clients.scans.trajectory import Trajectory
 
-__all__ = ["EPILOG", "add_options", "add_parser", "run"]
+__all__ = ["EPILOG", "add_options", "add_parser", "not_covered", "run"]
+
+_BEFORE_ODOMETRY_S: Final = 10.0  # scans may begin earlier than odometry
 
 EPILOG: Final = f"""\
 A scan's result is trusted when it is within all limits of trust.  A vehicle is
@@ -136,7 +139,7 @@ def run(args: argparse.Namespace) -> int:
         if first is None:
             return drive.no_scans()
         T_first, known = _start(args, first)
-        prediction = _prediction(args, T_first, subscriber, drive)
+        prediction = _prediction(args, T_first, subscriber, drive, first.stamp_s)
         matcher = stack.enter_context(matcher_from(args))
         client = stack.enter_context(connect(args, "shmmap-ndt"))
         maps = stack.enter_context(_map_updater(args, client, matcher, route))
@@ -229,6 +232,7 @@ def _prediction(
     T_first: NDArray[np.float64],
     subscriber: OdometrySubscriber | None,
     drive: ScanDrive,
+    first_s: float,
 ) -> MotionPrediction:
     """Return the motion prediction; its first velocity comes from the truth or the route's times."""
     from shmmap_clients.ndt_scan_matcher.drive import motion_prediction
@@ -249,7 +253,20 @@ def _prediction(
     read = read_trajectory(args.odometry)
     for note in read.notes if args.odometry != args.truth else ():
         drive.reader.say(note)
+    if note := not_covered(str(args.odometry), read, first_s):
+        drive.reader.say(note)
     return Odometry(T_first, lambda: read)
+
+
+def not_covered(name: str, odometry: Trajectory, first_s: float) -> str:
+    """Return a note if odometry has no times near the first scan's; empty if it has."""
+    low, high = float(odometry.stamps_s.min()), float(odometry.stamps_s.max())
+    if low - _BEFORE_ODOMETRY_S <= first_s <= high:
+        return ""
+    return (
+        f"{name} has times from {low:.12g} to {high:.12g} s, the first scan {first_s:.12g} s: no motion is known"
+        " from it; scans of a directory have the times of --truth, else they count from 0"
+    )
 
 
 def _relocalizer(args: argparse.Namespace, stack: contextlib.ExitStack) -> Relocalizer | None:

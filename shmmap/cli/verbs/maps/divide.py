@@ -252,6 +252,7 @@ def _merged_lines(made: MergedCloud) -> list[tuple[str, str]]:
         ("note", f"moved by ({', '.join(f'{v:.12g}' for v in origin)}) m, to the frame before {path}")
         for path, origin in made.origin.items()
     ]
+    notes += [("note", note) for note in made.notes]
     return [
         ("cloud", f"{made.path} ({format_bytes(made.bytes)})"),
         ("points", f"{made.points:,} from {counted(made.files, 'file')}"),
