@@ -61,7 +61,7 @@ ORIGIN_STEPS: Final = (
     *("sign.switch", "sign.switched", "sign.repaired"),
     *("sign.nextkey", "sign.nextroot", "sign.renewed", "sign.rotated"),
     *("restore.entry", "restore.looked"),
-    *("prune.entry", "prune.listed", "prune.object", "prune.part"),
+    *("prune.entry", "prune.listed", "prune.metadata", "prune.object", "prune.part"),
     *("slice.shard", "slice.part", "slice.made"),
     *("join.root", "join.entry", "join.looked", "join.part"),
     *("fetch.cell", "fetch.whole", "fetch.renamed"),

@@ -40,7 +40,7 @@ class CompilingLines:
         """Print a line, unless the last one was a moment ago."""
         if (now_s := time.monotonic()) >= self._due_s:
             self._due_s = now_s + _PAUSE_S
-            part = module.split(".")[1]
+            part = (module.split(".") * 2)[1]
             _say(f"{self._name}: compiling kernels, once for this version: {part}, {number} of {of}")
 
 
@@ -72,4 +72,6 @@ def _look(read: Callable[[], Snapshot], ended: threading.Event) -> None:
 
 
 def _say(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
+    from shmmap.cli.screens.output import print_line  # takes 5 ms to import: only where kernels are compiled
+
+    print_line(line, file=sys.stderr, flush=True)

@@ -112,7 +112,7 @@ def test_a_process_of_a_replaced_daemon_ends(
     until(lambda: counters(one)["package_replaced"] == 1, lambda: one.log)
     strict = verb(one, "health", "--strict")
     assert strict.returncode == 1
-    assert strict.stdout.count(RESTART) == 1
+    assert strict.stdout.count(f"\n  {RESTART} (") == 1
     assert one.log.count(f"ERROR   {RESTART}\n") == 1
     if ends == "live worker":
         (row,) = client.live_maps()

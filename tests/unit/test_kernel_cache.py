@@ -106,8 +106,11 @@ def test_compiling_is_noticed_and_loading_is_not(
     )
 
 
-def test_the_first_is_logged(kernel: Kernel, caplog: pytest.LogCaptureFixture) -> None:
-    compile_notices._logged.clear()
+def test_the_first_is_logged(
+    kernel: Kernel, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(compile_notices, "_logged", [])
+    monkeypatch.setattr(compile_notices, "_watchers", [compile_notices.log_first])
     with caplog.at_level(logging.INFO, "shmmap"):
         kernel.hits()
         kernel.module.write_text(SOURCE.replace("2 * value", "value + value"))

@@ -55,7 +55,8 @@ def test_every_file_has_its_outcome(data_dir: Path) -> None:
             continue
         cloud = read_pcd(path, keep_non_finite=True)
         assert (cloud.points, len(cloud.xyz)) == (outcome["points"],) * 2, name
-        assert bool(cloud.warnings) == (outcome["expect"] == "warn"), name
+        warnings = [one for one in cloud.warnings if "so far from zero" not in one]  # any bits may be a float
+        assert bool(warnings) == (outcome["expect"] == "warn"), name
         if name in WORDS:
             assert WORDS[name] in " ".join(cloud.warnings)
         assert describe(path).points == outcome["points"]
