@@ -163,7 +163,7 @@ def step_warning(
     reach = float(max(np.abs(low).max(), np.abs(high).max()))
     if axis.itemsize != 4 or not math.isfinite(reach) or reach * unit_m < FLOAT32_REACH_M:
         return ""
-    step = np.format_float_positional(float(np.spacing(np.float32(reach))), trim="-")
+    step = np.format_float_positional(math.ldexp(1.0, math.frexp(reach)[1] - 24), trim="-")
     return (
         f"x, y and z are float32 and so far from zero that they are multiples of {step}: what is finer was"
         " lost before; write them as float64, or nearer to zero"

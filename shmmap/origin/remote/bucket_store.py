@@ -112,6 +112,9 @@ _ASKED_FOR_CREDENTIALS: Final = (
 )
 """Variables with the URL of a server that obstore asks for credentials, or of a store."""
 _BYTES_PER_PAGE: Final = 1 << 19
+_LEAST_BYTES: Final = 64 << 10
+_BYTES_RATIO: Final = 16
+_LATER_S: Final = 1.0
 _ELSEWHERE: Final = "the bucket is in another region"
 _CODE: Final = re.compile(r"<Code>(\w+)</Code>")
 _REASONS: Final = {
@@ -171,9 +174,27 @@ class BucketStore:
         self._instance = instance_credentials
         self._timeouts = timeouts
         self._limit_s = timeouts.retry_s + answer_limit_s(timeouts.read_s, 0)
-        self._store = _opened(where, timeouts, insecure=insecure_http, instance=instance_credentials)
+        self._open = _opener(where, timeouts, insecure=insecure_http, instance=instance_credentials)
+        self._opened: dict[int, Any] = {}
+        self._opening = threading.Lock()
+        self._store()  # settings that cannot be used are refused now
         self._asking = threading.Lock()
         self._is_asked = False
+
+    def _store(self, nbytes: int = 0) -> Any:
+        """Return obstore's store for requests of up to ``nbytes``.
+
+        Only a limit for all requests of a store ends an error's text that drips.  It is above the stated
+        ones, so it ends what was given up here.
+        """
+        most = _LEAST_BYTES
+        while most < nbytes:
+            most *= _BYTES_RATIO
+        with self._opening:
+            if most not in self._opened:
+                more_s = answer_limit_s(self._timeouts.read_s, most)
+                self._opened[most] = self._open(self._limit_s + more_s + _LATER_S)
+            return self._opened[most]
 
     # --- reading --------------------------------------------------------------------------------
 
@@ -210,7 +231,7 @@ class BucketStore:
         name = self._name(path)
 
         def read() -> tuple[Body, Tag]:
-            result = obstore.get(self._store, path, options=options)
+            result = obstore.get(self._store(max_bytes), path, options=options)
             meta, headers = result.meta, result.attributes
             body = Body(
                 name,
@@ -230,7 +251,7 @@ class BucketStore:
         """Return an object's size and time of writing; None if it does not exist."""
 
         def head() -> Listed:
-            result = obstore.get(self._store, path, options={"head": True})
+            result = obstore.get(self._store(), path, options={"head": True})
             refuse_page(self._name(path), str(result.attributes.get("Content-Type", "")))
             return Listed(path, result.meta["size"], result.meta["last_modified"].timestamp())
 
@@ -241,7 +262,8 @@ class BucketStore:
 
     def list(self, prefix: str) -> Iterator[Listed]:
         """Yield all objects below a prefix."""
-        chunks = iter(obstore.list(self._store, prefix.rstrip("/"), chunk_size=_OBJECTS_PER_PAGE))
+        store = self._store(_BYTES_PER_PAGE)
+        chunks = iter(obstore.list(store, prefix.rstrip("/"), chunk_size=_OBJECTS_PER_PAGE))
 
         def next_page() -> Sequence[Any]:
             return next(chunks, ())
@@ -314,7 +336,7 @@ class BucketStore:
         return self._ask(
             path,
             lambda: obstore.put(
-                self._store, path, data, mode=mode, attributes=attributes, use_multipart=False
+                self._store(len(data)), path, data, mode=mode, attributes=attributes, use_multipart=False
             ),
             more_s=len(data) / BYTES_PER_S,
             conditional=mode is not None,
@@ -323,7 +345,7 @@ class BucketStore:
     def delete(self, path: str) -> None:
         """Remove an object."""
         try:
-            self._ask(path, lambda: obstore.delete(self._store, path))
+            self._ask(path, lambda: obstore.delete(self._store(), path))
         except MapMissing:
             return
 
@@ -511,13 +533,13 @@ def server_url(where: StoreUrl) -> str:
     return usual.get(where.scheme, "")
 
 
-def _opened(where: StoreUrl, timeouts: Timeouts, *, insecure: bool, instance: bool) -> Any:
+def _opener(where: StoreUrl, timeouts: Timeouts, *, insecure: bool, instance: bool) -> Callable[[float], Any]:
+    """Return a function that opens the store with a time limit for each request, in seconds."""
     endpoint = _endpoint(where.scheme)
     refuse_plain_http(where, endpoint, insecure_http=insecure)
     client: dict[str, Any] = {
         "connect_timeout": timedelta(seconds=timeouts.connect_s),
         "read_timeout": timedelta(seconds=timeouts.read_s),
-        "timeout": timedelta(days=1),  # each request has a limit of its own
         "allow_http": endpoint.lower().startswith("http://"),
         "user_agent": "shmmap",
         **_no_redirects(where),
@@ -531,21 +553,31 @@ def _opened(where: StoreUrl, timeouts: Timeouts, *, insecure: bool, instance: bo
             "base": 2,
         },
     }
-    given: dict[str, Any] = {"client_options": client, "retry_config": retry}
+    given: dict[str, Any] = {"retry_config": retry}
     try:
         os.environ.update(clean_variables(os.environ))  # obstore reads them by itself
         found = find_credentials(where.scheme, os.environ, instance=instance)
         if found.provider is not None:
             given["credential_provider"] = found.provider
-        kind: Any = {"s3": S3Store, "gs": GCSStore, "az": AzureStore}[where.scheme]
-        return kind.from_url(where.text, config=found.settings, **given)
-    except ConfigError:
-        raise
-    except (exceptions.BaseError, ValueError, TypeError, OSError):
-        raise ConfigError(
-            f"{where.text} cannot be opened with the settings and credentials given",
-            hint="look at the variables AWS_*, GOOGLE_*, AZURE_*, and at the files they name",
-        ) from None
+    except OSError:
+        raise _cannot_be_opened(where) from None
+    kind: Any = {"s3": S3Store, "gs": GCSStore, "az": AzureStore}[where.scheme]
+
+    def opened(limit_s: float) -> Any:
+        limited = {**client, "timeout": timedelta(seconds=limit_s)}
+        try:
+            return kind.from_url(where.text, config=found.settings, client_options=limited, **given)
+        except (exceptions.BaseError, ValueError, TypeError, OSError):
+            raise _cannot_be_opened(where) from None
+
+    return opened
+
+
+def _cannot_be_opened(where: StoreUrl) -> ConfigError:
+    return ConfigError(
+        f"{where.text} cannot be opened with the settings and credentials given",
+        hint="look at the variables AWS_*, GOOGLE_*, AZURE_*, and at the files they name",
+    )
 
 
 def _endpoint(scheme: str) -> str:

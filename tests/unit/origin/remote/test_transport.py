@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 
 from shmmap.errors import ConfigError, Offline, ShmmapError
+from shmmap.processes.request_threads import PREFIX
+from tests.support.daemon_process import Deadline
 from tests.support.web_servers import WRONG_ANSWERS, FaultyWeb, faulty_web
 
 pytest.importorskip("obstore", reason="obstore is not installed")
@@ -90,6 +92,9 @@ def test_each_wrong_answer_ends_under_its_name(web: FaultyWeb, scheme: str) -> N
             assert READ_OF[fault][scheme == "s3"] in says, (fault, says)
             assert "internal" not in says.lower()
             assert SECRET not in says
+    waiting = Deadline()
+    while waiting(any(one.name.startswith(PREFIX) for one in threading.enumerate())):
+        pass  # what was given up ends, too
 
 
 @pytest.mark.parametrize("scheme", ["http", "s3"])
@@ -205,7 +210,8 @@ def test_a_panic_is_the_failure_of_its_request(web: FaultyWeb) -> None:
 
     store = opened(web, "s3", AGAIN)
     bad = {"access_key_id": "key\nspoilt", "secret_access_key": "b", "endpoint": web.url, "region": "r"}
-    vars(store)["_store"] = S3Store("maps", config=bad, client_options={"allow_http": True})  # type: ignore[arg-type]
+    opened_bad = S3Store("maps", config=bad, client_options={"allow_http": True})  # type: ignore[arg-type]
+    vars(store)["_store"] = lambda _nbytes=0: opened_bad
     found: list[str] = []
     thread = threading.Thread(target=lambda: found.append(outcome(lambda: store.get("CURRENT", 99))))
     thread.start()
