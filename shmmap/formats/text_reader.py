@@ -49,6 +49,7 @@ _UNNAMED: Final = {1: ("intensity",), 3: _COLOURS, 4: ("intensity", *_COLOURS)}
 """Names of the columns after x, y and z, by their number, as in PTS files."""
 _NORMAL_LENGTHS: Final = (0.99, 1.01)
 _LOOKED_AT: Final = 1024  # rows to look at
+_FEW: Final = 10  # rows, which may be so by chance
 _LOOKED_AT_NORMALS: Final = 32
 _LARGE: Final = 1e100  # no coordinate; its square could not be computed
 _SHOWN: Final = 60
@@ -308,8 +309,8 @@ class _Lines:
             warnings.append(f"columns {count - 2} to {count} are no colours, which are integers of 0 to 255")
         if len(rows) > 1 and not (names_of_others and self.suffix in (".xyzn", ".xyzrgb")):
             self._check_first(rows, layout.data_at)
-        if others and len(rows) > 2 and (np.diff(rows[:, 0]) > 0).all() and (rows[:, 0] % 1 == 0).all():
-            warnings.append(f"the first column counts the rows: if it is no coordinate, {NAME_THEM}")
+        if others and (odd := _odd_first(rows)):
+            warnings.append(f"the first column {odd}: if it is no coordinate, {NAME_THEM}")
         if not names_of_others:
             names_of_others = [f"column_{place}" for place in range(4, count + 1)]
         layout.names = [*AXES, *names_of_others]
@@ -347,6 +348,19 @@ class _Lines:
         """Whether three columns can be a colour; in a file that says so by its name, up to 1, too."""
         floats = self.suffix == ".xyzrgb" and ((values >= 0) & (values <= 1)).all()
         return bool(floats) or _are_bytes(values)
+
+
+def _odd_first(rows: NDArray[np.float64]) -> str:
+    """Return what makes the first of four or more columns unlike a coordinate; empty if nothing does."""
+    first = rows[:, 0]
+    rises, whole = bool((np.diff(first) > 0).all()), bool((first % 1 == 0).all())
+    if len(rows) > 2 and rises and whole:
+        return "counts the rows"
+    if len(rows) < _FEW:
+        return ""
+    if whole and (rows[:, 1:4] % 1 != 0).any(axis=0).all():
+        return "has integers alone, unlike the next three"
+    return "rises with each row, as times do" if rises else ""
 
 
 def _are_bytes(values: NDArray[np.float64]) -> bool:

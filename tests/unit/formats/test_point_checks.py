@@ -8,6 +8,7 @@ from pathlib import Path
 import laspy
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from shmmap.cli.entry import main
 from shmmap.dividing.divide import divide
@@ -267,3 +268,23 @@ def test_rows_of_zeros_are_named(tmp_path: Path) -> None:
     path = tmp_path / "a.pts"
     path.write_text(f"{N + 2}\n" + rows(*XYZ, [1] * N) + "0 0 0 0\n" * 2)
     assert "2 points are at exactly (0, 0, 0)" in " ".join(read_cloud(path).warnings)
+
+
+@pytest.mark.parametrize(
+    ("first", "odd"),
+    [
+        (np.arange(200) % 64, "has integers alone, unlike the next three"),
+        (np.arange(200)[::-1], "has integers alone"),
+        (1.6e9 + np.arange(200) * 0.0625, "rises with each row, as times do"),
+        (np.arange(200) * 3.0, "counts the rows"),
+        (np.random.default_rng(2).normal(size=200), ""),
+    ],
+)
+def test_a_first_column_unlike_a_coordinate_is_named(
+    tmp_path: Path, first: NDArray[np.float64], odd: str
+) -> None:
+    xyz = np.random.default_rng(1).normal(size=(200, 3)) * 10
+    path = tmp_path / "a.xyz"
+    np.savetxt(path, np.column_stack([first, xyz]), fmt="%.4f")
+    said = " ".join(read_cloud(path).warnings)
+    assert f"the first column {odd}" in said if odd else "first column" not in said

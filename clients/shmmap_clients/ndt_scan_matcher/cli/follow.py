@@ -264,8 +264,8 @@ def not_covered(name: str, odometry: Trajectory, first_s: float) -> str:
     if low - _BEFORE_ODOMETRY_S <= first_s <= high:
         return ""
     return (
-        f"{name} has times from {low:.12g} to {high:.12g} s, the first scan {first_s:.12g} s: no motion is known"
-        " from it; scans of a directory have the times of --truth, else they count from 0"
+        f"{name} has times from {low:.12g} to {high:.12g} s, the first scan {first_s:.12g} s: no motion is"
+        " known from it; scans of a directory have the times of --truth, else they count from 0"
     )
 
 
