@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from shmmap.errors import NoColumn
 from shmmap.lazy_imports import needed_packages
+from shmmap.open3d_loading import load_open3d
 from shmmap.protocol.messages import Handle
 from shmmap.segment.attach import AttachedSegment, attach_writable
 from shmmap.segment.layout import Lattice, SegmentHeader, SourceStamp
@@ -276,8 +277,6 @@ class Cell:
         ShmmapError
             Open3D is not installed, or lacks libraries of the system; the hint names them.
         """
-        from shmmap.open3d_loading import load_open3d
-
         o3d = load_open3d("to_open3d()")
         cloud: open3d.t.geometry.PointCloud = o3d.t.geometry.PointCloud()
         for name, view in self._writable().items():

@@ -518,7 +518,7 @@ class Client:
 def _load_all() -> None:
     """Import what a session may need later: an upgrade may replace the package's files under this program."""
     for name in (
-        *("lacking", "mounts", "open3d_loading", "protocol.live"),
+        *("lacking", "mounts", "protocol.live"),
         *("client.handed_over", "client.map_listing", "client.points_around"),
     ):
         importlib.import_module(f"shmmap.{name}")
