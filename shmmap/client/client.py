@@ -53,8 +53,8 @@ class MapOrigin(NamedTuple):
         Name of the coordinate system, with its EPSG code if the files contain it; None if they name no
         system.
     unit_m : tuple of float
-        Length of the system's units in metres, horizontal and vertical; (1, 1) unless `divide` converted
-        feet.
+        Length of the system's units in metres, horizontal and vertical; (1, 1) unless another unit was
+        converted.
     """
 
     x: float

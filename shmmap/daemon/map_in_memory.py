@@ -22,11 +22,11 @@ from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.config_live import LiveSettings, live_directory
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.host.memory import (
-    available_bytes,
     choose_budget,
     loader_bytes,
     memory_limit_bytes,
     room_bytes,
+    usable_bytes,
 )
 from shmmap.daemon.live.messages import Begin
 from shmmap.daemon.loading.adoption import Adoption
@@ -95,7 +95,7 @@ def share_of_live_maps(
 
 
 def _default_share(maps: int, most: int) -> int:
-    return max(LEAST_BYTES * maps, min(most, available_bytes(), CEILING_BYTES))
+    return max(LEAST_BYTES * maps, min(most, usable_bytes(), CEILING_BYTES))
 
 
 def place_live_maps(

@@ -309,7 +309,7 @@ def drive_through_outage(
 
 
 def statistics_now(daemon: DaemonProcess) -> Snapshot:
-    """Read statistics that a daemon writes after this call; it writes them four times a second.
+    """Read statistics that a daemon writes after this call; it writes them every second at least.
 
     Unlike the request `Stats` this costs the daemon no processor time.
     """

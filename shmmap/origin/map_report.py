@@ -52,7 +52,8 @@ class MapFrame(msgspec.Struct, frozen=True):
         Name of the inputs' coordinate system with its EPSG code, such as
         ``WGS 84 / UTM zone 32N (EPSG:32632)``; empty if the inputs do not give it.
     unit_m
-        Metres per unit of that system, in the plane and in height: (1, 1) unless `divide` converted feet.
+        Metres per unit of that system, in the plane and in height: (1, 1) unless another unit was
+        converted.
     """
 
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)

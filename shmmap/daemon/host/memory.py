@@ -16,13 +16,13 @@ from shmmap.mounts import control_groups, group_values
 from shmmap.segment.directory import ShmDirectory
 
 __all__ = [
-    "available_bytes",
     "choose_budget",
     "loader_bytes",
     "memory_limit_bytes",
     "out_of_memory_kills",
     "room_bytes",
     "room_in_group",
+    "usable_bytes",
 ]
 
 DEFAULT_CEILING_BYTES: Final = 4 << 30
@@ -58,8 +58,8 @@ def room_in_group(limit_bytes: int) -> int:
     return limit_bytes - min(limit_bytes // 2, RESERVE_BYTES)
 
 
-def available_bytes(ours_bytes: int = 0) -> int:
-    """Return a quarter of the available memory, which is the most that is used by default.
+def usable_bytes(ours_bytes: int = 0) -> int:
+    """Return the most bytes that are used by default: a quarter of the available memory.
 
     ``ours_bytes`` are those that a previous run of the daemon left in shared memory.
     """
@@ -122,8 +122,7 @@ def choose_budget(
                 f" {free >> 20:,} MiB free",
                 hint="free some, lower --budget, or enlarge the tmpfs (docker: --shm-size)",
             )
-        group_room = room_in_group(limit_bytes) if limit_bytes is not None else LARGEST
-        if limit_bytes is not None and asked_bytes > group_room:
+        if limit_bytes is not None and asked_bytes > (group_room := room_in_group(limit_bytes)):
             raise ConfigError(
                 f"a budget of {asked_bytes >> 20:,} MiB does not fit the control group's memory limit of"
                 f" {limit_bytes >> 20:,} MiB, of which {limit_bytes - group_room >> 20:,} MiB are left to the"
@@ -137,7 +136,7 @@ def choose_budget(
             )
         return asked_bytes
     room = room_bytes(directory, ours_bytes, limit_bytes)
-    budget = min(available_bytes(ours_bytes), DEFAULT_CEILING_BYTES, room - beside_bytes)
+    budget = min(usable_bytes(ours_bytes), DEFAULT_CEILING_BYTES, room - beside_bytes)
     if budget < SMALLEST_BYTES:
         raise CannotStart(
             f"{directory.path} has only {free} bytes free",

@@ -115,7 +115,7 @@ BAD: dict[str, tuple[Rule, type[ShmmapError], str]] = {
     "412 to all": (conditional(412), CannotWrite, "does not replace an object whose ETag is named"),
     "a page": (page(), StoreRefused, r"what the store answers is no map: a page \(text/html\)"),
     "a page with an ETag": (page(etag='"1"'), StoreRefused, r"a page \(text/html\)"),
-    "a page, no HTML": (page(etag='"1"', **{"content-type": "text/plain"}), StoreRefused, r"a page \(te"),
+    "a page, no HTML": (page(etag='"1"', **{"content-type": "text/plain"}), StoreRefused, r"page \(text"),
     "writes get lost": (swallowed, StoreRefused, "has accepted it, and does not have it"),
     "403 to all": (lambda *_: Answer(403), StoreRefused, "no permission"),
     "503": (conditional(503), StoreRefused, r"status 503"),
