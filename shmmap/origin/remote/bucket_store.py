@@ -234,23 +234,22 @@ class BucketStore:
     ) -> tuple[Body, Tag]:
         """Return the body and the tag of the answer for an object."""
         name = self._name(path)
-
-        def read() -> tuple[Body, Tag]:
-            result = obstore.get(self._store(max_bytes), path, options=options)
-            meta, headers = result.meta, result.attributes
-            body = Body(
-                name,
-                meta["size"],
-                max_bytes,
-                exact=exact,
-                media_type=str(headers.get("Content-Type", "")),
-                encoding=str(headers.get("Content-Encoding", "")),
-            )
-            _fill(name, body, result, answer_limit_s(self._timeouts.read_s, meta["size"]))
-            return body, _named(meta)
-
-        more_s = answer_limit_s(self._timeouts.read_s, max_bytes)
-        return self._ask(path, read, more_s=more_s, conditional=options is not None)
+        store = self._store(max_bytes)
+        result = self._ask(
+            path, lambda: obstore.get(store, path, options=options), conditional=options is not None
+        )
+        meta, headers = result.meta, result.attributes
+        body = Body(
+            name,
+            meta["size"],
+            max_bytes,
+            exact=exact,
+            media_type=str(headers.get("Content-Type", "")),
+            encoding=str(headers.get("Content-Encoding", "")),
+        )
+        limit_s = answer_limit_s(self._timeouts.read_s, meta["size"])
+        self._ask(path, lambda: _fill(name, body, result, limit_s), more_s=limit_s)
+        return body, _named(meta)
 
     def head(self, path: str) -> Listed | None:
         """Return an object's size and time of writing; None if it does not exist."""

@@ -133,6 +133,10 @@ ODD_ANSWERS = {
 }
 
 
+def test_an_error_that_drips_ends_as_soon_for_a_large_object(web: FaultyWeb) -> None:
+    assert f"{SLOW} 2 s" in outcome(partial(opened(web, "s3").get, "drip error", 1 << 30))
+
+
 def _only(answer: bytes, _data: bytes) -> list[bytes]:
     return [answer]
 
