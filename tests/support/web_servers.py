@@ -36,7 +36,7 @@ PAGE = b"<!DOCTYPE html>\n<html><body>Please log in</body></html>\n"
 
 
 def _head(status: str, *lines: str) -> bytes:
-    return "\r\n".join([f"HTTP/1.1 {status}", *lines, "", ""]).encode()
+    return "\r\n".join([f"HTTP/1.1 {status}", "Connection: close", *lines, "", ""]).encode()
 
 
 def _length(data: bytes) -> str:
@@ -74,7 +74,7 @@ WRONG_ANSWERS: dict[str, Callable[[bytes], Iterable[bytes]]] = {
     "chunked cut": lambda data: [
         _head("200 OK", "Transfer-Encoding: chunked"), _chunk(data[: len(data) // 2])
     ],
-    "no length": lambda data: [_head("200 OK", "Connection: close"), data],
+    "no length": lambda data: [_head("200 OK"), data],
     "cut": lambda data: [_head("200 OK", _length(data)), data[: len(data) // 2]],
     "gzip": lambda data: [
         _head("200 OK", "Content-Encoding: gzip", _length(packed := gzip.compress(data))), packed

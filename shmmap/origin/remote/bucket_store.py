@@ -65,7 +65,7 @@ _IMMUTABLE: Final = {
     "Content-Type": "application/zstd",
 }
 _CHANGES: Final = {"Cache-Control": "no-cache", "Content-Type": "application/json"}
-_STATUS: Final = re.compile(r"\b([45]\d\d)\b (?:[A-Z][A-Za-z ]+)|status(?: code)?:? ([45]\d\d)")
+_STATUS: Final = re.compile(r"\b([45]\d\d)\b (?:[A-Z][A-Za-z ]+)|status(?: code)?:? ([1-9]\d\d)")
 _MOVED: Final = re.compile(r"status code: 30[12378]\b")
 _UNASKED: Final = re.compile(r"status code: 304\b")
 _AGAIN: Final = "try again later"
@@ -87,6 +87,10 @@ _TRUE_NAMES: Final = (
     ),
     ("list response body", "its listing ended early", BETWEEN),
     ("Parse(", "the answer is no HTTP", "is the address right, and its port?"),
+    ("source: Header {", "its answer has a header that cannot be read", BETWEEN),
+    ("source: Metadata {", "its answer has a header that cannot be read", BETWEEN),
+    ("source: InvalidContentType {", "its answer has a header that cannot be read", BETWEEN),
+    ("invalid utf-8 sequence", "refused, with an error that is no UTF-8", BETWEEN),
 )
 """What is in the text of an obstore error, what it means, and a hint."""
 _NOWHERE: Final = "255.255.255.255:1"
@@ -175,26 +179,27 @@ class BucketStore:
         self._timeouts = timeouts
         self._limit_s = timeouts.retry_s + answer_limit_s(timeouts.read_s, 0)
         self._open = _opener(where, timeouts, insecure=insecure_http, instance=instance_credentials)
-        self._opened: dict[int, Any] = {}
+        self._opened: dict[tuple[int, bool], Any] = {}
         self._opening = threading.Lock()
         self._store()  # settings that cannot be used are refused now
         self._asking = threading.Lock()
         self._is_asked = False
 
-    def _store(self, nbytes: int = 0) -> Any:
-        """Return obstore's store for requests of up to ``nbytes``.
+    def _store(self, nbytes: int = 0, *, sends: bool = False) -> Any:
+        """Return obstore's store for requests that read, or send, up to ``nbytes``.
 
-        Only a limit for all requests of a store ends an error's text that drips.  It is above the stated
-        ones, so it ends what was given up here.
+        obstore takes the time in which it sends for silence, and only a limit for all requests of a store
+        ends an error's text that drips.  That limit is above the stated ones, so it ends what was given up.
         """
         most = _LEAST_BYTES
         while most < nbytes:
             most *= _BYTES_RATIO
         with self._opening:
-            if most not in self._opened:
-                more_s = answer_limit_s(self._timeouts.read_s, most)
-                self._opened[most] = self._open(self._limit_s + more_s + _LATER_S)
-            return self._opened[most]
+            if (most, sends) not in self._opened:
+                limit_s = self._limit_s + _LATER_S + 2 * answer_limit_s(self._timeouts.read_s, most)
+                sending_s = answer_limit_s(0.0, most) if sends else 0.0
+                self._opened[most, sends] = self._open(limit_s, sending_s)
+            return self._opened[most, sends]
 
     # --- reading --------------------------------------------------------------------------------
 
@@ -229,23 +234,22 @@ class BucketStore:
     ) -> tuple[Body, Tag]:
         """Return the body and the tag of the answer for an object."""
         name = self._name(path)
-
-        def read() -> tuple[Body, Tag]:
-            result = obstore.get(self._store(max_bytes), path, options=options)
-            meta, headers = result.meta, result.attributes
-            body = Body(
-                name,
-                meta["size"],
-                max_bytes,
-                exact=exact,
-                media_type=str(headers.get("Content-Type", "")),
-                encoding=str(headers.get("Content-Encoding", "")),
-            )
-            _fill(name, body, result, answer_limit_s(self._timeouts.read_s, meta["size"]))
-            return body, _named(meta)
-
-        more_s = answer_limit_s(self._timeouts.read_s, max_bytes)
-        return self._ask(path, read, more_s=more_s, conditional=options is not None)
+        store = self._store(max_bytes)
+        result = self._ask(
+            path, lambda: obstore.get(store, path, options=options), conditional=options is not None
+        )
+        meta, headers = result.meta, result.attributes
+        body = Body(
+            name,
+            meta["size"],
+            max_bytes,
+            exact=exact,
+            media_type=str(headers.get("Content-Type", "")),
+            encoding=str(headers.get("Content-Encoding", "")),
+        )
+        limit_s = answer_limit_s(self._timeouts.read_s, meta["size"])
+        self._ask(path, lambda: _fill(name, body, result, limit_s), more_s=limit_s)
+        return body, _named(meta)
 
     def head(self, path: str) -> Listed | None:
         """Return an object's size and time of writing; None if it does not exist."""
@@ -268,12 +272,14 @@ class BucketStore:
         def next_page() -> Sequence[Any]:
             return next(chunks, ())
 
-        is_empty = True
+        began: set[str] = set()
         while page := self._ask(prefix, next_page, more_s=_BYTES_PER_PAGE / BYTES_PER_S):
-            is_empty = False
+            if page[0]["path"] in began:
+                raise StoreRefused(f"{self._name(prefix)}: its listing repeats without end", hint=BETWEEN)
+            began.add(page[0]["path"])
             for meta in page:
                 yield Listed(meta["path"], meta["size"], meta["last_modified"].timestamp())
-        if is_empty:  # obstore takes a page for an empty listing
+        if not began:  # obstore takes a page for an empty listing
             self.head(f"{prefix}none")
 
     # --- writing --------------------------------------------------------------------------------
@@ -336,9 +342,14 @@ class BucketStore:
         return self._ask(
             path,
             lambda: obstore.put(
-                self._store(len(data)), path, data, mode=mode, attributes=attributes, use_multipart=False
+                self._store(len(data), sends=True),
+                path,
+                data,
+                mode=mode,
+                attributes=attributes,
+                use_multipart=False,
             ),
-            more_s=len(data) / BYTES_PER_S,
+            more_s=2 * answer_limit_s(0.0, len(data)),  # it is sent twice if there is no answer
             conditional=mode is not None,
         )
 
@@ -498,9 +509,9 @@ def _out_of_reach(name: str, text: str) -> Offline:
         return unasked_304(name)
     if _NO_TAG in text:
         return NoTag(f"{name}: its answer has no ETag", hint=BETWEEN)
-    for part, says, hint in _TRUE_NAMES:
+    for part, says, its_hint in _TRUE_NAMES:
         if part in text:
-            return StoreRefused(f"{name}: {says}", hint=hint)
+            return StoreRefused(f"{name}: {says}", hint=its_hint)
     if status:
         return StoreRefused(f"{name}: refused (status {status})", hint=hint, status=status)
     if "redirect" in text.lower():
@@ -533,27 +544,30 @@ def server_url(where: StoreUrl) -> str:
     return usual.get(where.scheme, "")
 
 
-def _opener(where: StoreUrl, timeouts: Timeouts, *, insecure: bool, instance: bool) -> Callable[[float], Any]:
-    """Return a function that opens the store with a time limit for each request, in seconds."""
+def _opener(
+    where: StoreUrl, timeouts: Timeouts, *, insecure: bool, instance: bool
+) -> Callable[[float, float], Any]:
+    """Return a function that opens the store.
+
+    Its arguments: the time limit of each request, and how long sending may take; seconds.
+    """
     endpoint = _endpoint(where.scheme)
     refuse_plain_http(where, endpoint, insecure_http=insecure)
     client: dict[str, Any] = {
         "connect_timeout": timedelta(seconds=timeouts.connect_s),
-        "read_timeout": timedelta(seconds=timeouts.read_s),
         "allow_http": endpoint.lower().startswith("http://"),
         "user_agent": "shmmap",
         **_no_redirects(where),
     }
     retry: dict[str, Any] = {
         "max_retries": timeouts.retries,
-        "retry_timeout": timedelta(seconds=timeouts.retry_s),
         "backoff": {
             "init_backoff": timedelta(milliseconds=50),
             "max_backoff": timedelta(seconds=5),
             "base": 2,
         },
     }
-    given: dict[str, Any] = {"retry_config": retry}
+    given: dict[str, Any] = {}
     try:
         os.environ.update(clean_variables(os.environ))  # obstore reads them by itself
         found = find_credentials(where.scheme, os.environ, instance=instance)
@@ -563,10 +577,14 @@ def _opener(where: StoreUrl, timeouts: Timeouts, *, insecure: bool, instance: bo
         raise _cannot_be_opened(where) from None
     kind: Any = {"s3": S3Store, "gs": GCSStore, "az": AzureStore}[where.scheme]
 
-    def opened(limit_s: float) -> Any:
-        limited = {**client, "timeout": timedelta(seconds=limit_s)}
+    def opened(limit_s: float, sending_s: float) -> Any:
+        client["timeout"] = timedelta(seconds=limit_s)
+        client["read_timeout"] = timedelta(seconds=timeouts.read_s + sending_s)
+        retry["retry_timeout"] = timedelta(seconds=timeouts.retry_s + sending_s)
         try:
-            return kind.from_url(where.text, config=found.settings, client_options=limited, **given)
+            return kind.from_url(
+                where.text, config=found.settings, client_options=client, retry_config=retry, **given
+            )
         except (exceptions.BaseError, ValueError, TypeError, OSError):
             raise _cannot_be_opened(where) from None
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -21,7 +22,7 @@ pytest.importorskip("zstandard", reason="zstandard is not installed")
 
 from shmmap.origin.remote.map_versions import refuse_if_signed
 from shmmap.origin.remote.opened_store import open_store
-from shmmap.origin.remote.store import Store, Timeouts
+from shmmap.origin.remote.store import Store, StoreRefused, Timeouts
 
 ONCE = Timeouts(connect_s=5.0, read_s=0.5, retries=0, retry_s=0.0)
 AGAIN = Timeouts(connect_s=5.0, read_s=5.0, retries=4, retry_s=60.0)
@@ -115,6 +116,66 @@ def test_a_bucket_s_other_answers_have_their_names(web: FaultyWeb) -> None:
         assert says in outcome(lambda: list(store.list("versions/"))), fault
     for fault, says in (("page", "no ETag"), ("continue", "no answer in time"), ("drip error", SLOW)):
         assert says in outcome(lambda: store.put("blobs/sha256/aa", b"1")), fault
+    fault = "503"
+    with pytest.raises(StoreRefused, match="status 503") as refused:
+        store.get("CURRENT", 99)
+    assert refused.value.hint == "try again later"
+
+
+ODD_ANSWERS = {
+    b"300 Several\r\nLocation: http://localhost/": "refused (status 300)",
+    b"101 Other\r\nUpgrade: h2c\r\nConnection: upgrade": "refused (status 101)",
+    b"600 Odd": "refused (status 600)",
+    b"200 OK\r\nLast-Modified: now": "a header that cannot be read",
+    b"200 OK\r\nETag: \xff": "a header that cannot be read",
+    b"200 OK\r\nContent-Type: \xff": "a header that cannot be read",
+    b"403 Forbidden": "refused, with an error that is no UTF-8",
+}
+
+
+def test_an_error_that_drips_ends_as_soon_for_a_large_object(web: FaultyWeb) -> None:
+    assert f"{SLOW} 2 s" in outcome(partial(opened(web, "s3").get, "drip error", 1 << 30))
+
+
+def _only(answer: bytes, _data: bytes) -> list[bytes]:
+    return [answer]
+
+
+def test_what_a_bucket_answers_is_no_silence(web: FaultyWeb, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = opened(web, "s3")
+    for number, (odd, says) in enumerate(ODD_ANSWERS.items()):
+        body = b"\xff" if says.endswith("UTF-8") else b"x"
+        answer = b"HTTP/1.1 %s\r\nContent-Length: 1\r\n\r\n%s" % (odd, body)
+        monkeypatch.setitem(WRONG_ANSWERS, f"odd {number}", partial(_only, answer))
+        assert says in outcome(partial(store.get, f"odd {number}", 99)), odd
+
+
+def test_an_upload_may_take_longer_than_silence(web: FaultyWeb) -> None:
+    store = opened(web, "s3")
+
+    def take_in_slowly(_path: str) -> str:
+        time.sleep(2 * ONCE.read_s)
+        return ""
+
+    web.fault = take_in_slowly
+    store.put("blobs/sha256/aa", bytes(3 << 20))
+
+
+NAMES = b"".join(
+    b"<Contents><Key>m/v/%d</Key><LastModified>2026-01-01T00:00:00.000Z</LastModified><Size>5</Size></Contents>"
+    % at
+    for at in range(999)
+)
+NEXT = b"<NextContinuationToken>more</NextContinuationToken>"
+
+
+def test_a_listing_that_repeats_is_no_listing(web: FaultyWeb) -> None:
+    store = opened(web, "s3")
+    web.fault = lambda _path: ""
+    web.read = lambda _path: b"<ListBucketResult>%s%s</ListBucketResult>" % (NAMES, NEXT)
+    assert "its listing repeats without end" in outcome(lambda: sum(1 for _ in store.list("v/")))
+    web.read = lambda _path: b"<ListBucketResult>%s</ListBucketResult>" % NAMES
+    assert sum(1 for _ in store.list("v/")) == 999
 
 
 @pytest.mark.parametrize(
@@ -211,7 +272,7 @@ def test_a_panic_is_the_failure_of_its_request(web: FaultyWeb) -> None:
     store = opened(web, "s3", AGAIN)
     bad = {"access_key_id": "key\nspoilt", "secret_access_key": "b", "endpoint": web.url, "region": "r"}
     opened_bad = S3Store("maps", config=bad, client_options={"allow_http": True})  # type: ignore[arg-type]
-    vars(store)["_store"] = lambda _nbytes=0: opened_bad
+    vars(store)["_store"] = lambda _nbytes=0, **_: opened_bad
     found: list[str] = []
     thread = threading.Thread(target=lambda: found.append(outcome(lambda: store.get("CURRENT", 99))))
     thread.start()
