@@ -99,16 +99,20 @@ class LasChecks(PointChecks):
 
 # --- text -----------------------------------------------------------------------------------------------
 
-_STEPS: Final = (100.0, 10.0, 1.0, 0.5)
+_STEPS: Final = (100_000.0, 10_000.0, 1000.0, 100.0, 10.0, 1.0, 0.5)
 _MANY: Final = 100  # points; fewer may lie on a lattice by chance
 
 
 class TextChecks(PointChecks):
-    """Extents of coordinates whose columns are guessed, rows of zeros, and rounding."""
+    """Extents of coordinates whose columns are guessed, rows of zeros, and rounding.
 
-    def __init__(self, *, guessed: bool) -> None:
+    ``unit_m`` are metres per unit of x and y, and of z.
+    """
+
+    def __init__(self, *, guessed: bool, unit_m: tuple[float, float] = (1.0, 1.0)) -> None:
         super().__init__()
         self._guessed = guessed
+        self._unit_m = unit_m
 
     def add(self, columns: Columns) -> None:
         """Add points."""
@@ -146,7 +150,13 @@ class TextChecks(PointChecks):
         rounded = []
         for axis in "xyz" if points >= _MANY else "":
             step, low, high = (counts[f"{name}_{axis}"] for name in ("step", "low", "high"))
-            if step < len(_STEPS) and low < high and max(-low, high) >= FLOAT32_REACH_M:
+            unit_m = self._unit_m[axis == "z"]
+            if (
+                step < len(_STEPS)
+                and low < high
+                and _STEPS[int(step)] * unit_m >= _STEPS[-1]
+                and max(-low, high) * unit_m >= FLOAT32_REACH_M
+            ):
                 rounded.append(f"all {axis} are multiples of {_STEPS[int(step)]:g}")
         if rounded:
             notes.append(f"{', '.join(rounded)}: rounded when the file was written?")
@@ -163,7 +173,8 @@ def step_warning(
     reach = float(max(np.abs(low).max(), np.abs(high).max()))
     if axis.itemsize != 4 or not math.isfinite(reach) or reach * unit_m < FLOAT32_REACH_M:
         return ""
-    step = np.format_float_positional(math.ldexp(1.0, math.frexp(reach)[1] - 24), trim="-")
+    exponent = math.frexp(float(np.float32(reach)))[1]
+    step = np.format_float_positional(math.ldexp(1.0, exponent - 24), trim="-")
     return (
         f"x, y and z are float32 and so far from zero that they are multiples of {step}: what is finer was"
         " lost before; write them as float64, or nearer to zero"

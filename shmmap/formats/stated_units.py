@@ -63,7 +63,7 @@ _NAMES: Final[dict[str, LengthUnit]] = {
 }
 _BRACKET: Final = re.compile(r"(.*?[^\s])\s*[\[({<](.*?)[\])}>]?$")
 _UNIT: Final = re.compile(r"\s*[\[({<][^\[\](){}<>]*[\])}>]")
-_GLUED: Final = re.compile(r"([xyz])([a-zµμ]{2,})")
+_GLUED: Final = re.compile(r"([xyz])([a-zµμ]+)")
 _SAID: Final = re.compile(r"^\s*(?:(?:all )?in\s+|units?\s*[:=]\s*)")
 _BETWEEN: Final = re.compile(r"\s+in\s+|[\s/_:.\-]+")
 
@@ -136,7 +136,9 @@ def _taken_apart(name: str) -> list[_Name]:
     text = name.strip().strip("\"'").strip().lower()
     if found := _BRACKET.fullmatch(text):
         base, inner = found.groups()
-        unit = named_unit(inner)
+        # of several brackets, as in `X(East) [m]`, one may be a unit
+        parts = [inner, *re.split(r"[\[\](){}<>]+", inner)]
+        unit = next((unit for part in parts if (unit := named_unit(part))), None)
         return [_Name(way.base, unit or way.unit, "" if unit else inner) for way in _taken_apart(base)]
     ways = [_Name(_common(text), None)]
     for between in _BETWEEN.finditer(text):

@@ -103,7 +103,8 @@ class TextReader(FileReader):
         self.bounds: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
         self.encoding = self.version = ""
         self.warnings: tuple[str, ...] = self._layout.warnings
-        self.checks = TextChecks(guessed=self._layout.guessed)
+        plane, height = (self.crs or CoordinateSystem()).units
+        self.checks = TextChecks(guessed=self._layout.guessed, unit_m=(plane.metres, height.metres))
 
     def _read_header(self) -> None:
         head = self._source.peek(min(self._source.size, _HEAD_BYTES))

@@ -175,7 +175,10 @@ class MapDirectory:
                 hint="a divided map is a directory of PCD files; `shmmap divide` makes one of other clouds",
             )
         if layout.metadata is None:
-            return _without_metadata(files, layout.root, opened)
+            catalogue = _without_metadata(files, layout.root, opened)
+            if layout.root != self.path and (hint := _divided_hint(layout.root)):
+                catalogue.problems += (f"{layout.root} is served, the map in one piece; {hint}",)
+            return catalogue
         entries = parse_metadata(data, path=layout.metadata, strict=self.strict)
         del data  # with ten million cells it is the largest table of all
         catalogue = _joined(layout, layout.metadata, files, entries, strict=self.strict)

@@ -54,6 +54,7 @@ from shmmap.origin.remote.signed_metadata import (
     target_of,
 )
 from shmmap.origin.remote.store import Store, put_over
+from shmmap.private_directory import require_private
 
 __all__ = ["LIFETIMES", "ROOT_FILE", "MapSigner", "Refreshed", "Rotated"]
 
@@ -401,7 +402,7 @@ class MapSigner:
     def _make_keys(self) -> None:
         """Create missing keys, and then the root of trust that names them."""
         with writing_errors(self._directory):
-            os.makedirs(self._directory, mode=0o700, exist_ok=True)
+            require_private(self._directory)
             for name in dict.fromkeys(_KEYS.values()):
                 path = os.path.join(self._directory, f"{name}.pem")
                 if not os.path.lexists(path):

@@ -236,3 +236,18 @@ def test_a_published_directory_with_links_of_another_account(tmp_path: Path) -> 
     assert os.listdir(victim) == ["precious"]
     store.put("new/below/a", b"x")
     assert [found.path for found in store.list("new/")] == ["new/below/a"]
+
+
+@pytest.mark.root
+def test_new_keys_are_not_put_into_a_directory_of_another_account(tmp_path: Path) -> None:
+    signing = pytest.importorskip("shmmap.publishing.signing")
+    keys = tmp_path / "keys"
+    keys.mkdir()
+    os.chown(keys, OTHER_USER, OTHER_USER)
+    store = DirectoryStore(str(tmp_path / "published"))
+    with pytest.raises(CannotWrite, match=f"belongs to user {OTHER_USER}"):
+        signing.MapSigner(store, str(keys))
+    assert os.listdir(keys) == []
+    os.chown(keys, 0, 0)
+    signing.MapSigner(store, str(keys))
+    assert "ROOT.json" in os.listdir(keys)

@@ -288,3 +288,14 @@ def test_a_first_column_unlike_a_coordinate_is_named(
     np.savetxt(path, np.column_stack([first, xyz]), fmt="%.4f")
     said = " ".join(read_cloud(path).warnings)
     assert f"the first column {odd}" in said if odd else "first column" not in said
+
+
+@pytest.mark.parametrize(
+    ("header", "factor", "rounded"),
+    [("x [mm],y [mm],z [mm]", 1, False), ("x [mm],y [mm],z [mm]", 1000, True), ("x,y,z", 1, True)],
+)
+def test_rounding_is_looked_at_in_metres(tmp_path: Path, header: str, factor: int, rounded: bool) -> None:
+    path = tmp_path / "a.csv"
+    xyz = (np.arange(600).reshape(200, 3) + 691_000) * factor
+    np.savetxt(path, xyz, fmt="%d", delimiter=",", header=header, comments="")
+    assert ("rounded when the file was written" in " ".join(read_cloud(path).warnings)) == rounded

@@ -399,3 +399,14 @@ def test_cells_that_state_another_unit_are_reported(tmp_path: Path) -> None:
     for place in (root, alone):
         (problem,) = open_map(place).load().problems
         assert "not in metres: x, y and z are in millimetres" in problem
+
+
+def test_a_whole_map_that_is_served_beside_cells_is_reported(tmp_path: Path) -> None:
+    """The metadata lies within the cells' folder, where it is not found from the folder above."""
+    make_single(tmp_path / "pointcloud_map.pcd")
+    put_cells(tmp_path / "pointcloud_map")
+    (tmp_path / "pointcloud_map" / "pointcloud_map_metadata.yaml").write_text(metadata_text())
+    (problem,) = open_map(tmp_path).load().problems
+    assert f"seems to be {tmp_path / 'pointcloud_map'}: name that" in problem
+    assert open_map(tmp_path / "pointcloud_map.pcd").load().problems == ()
+    assert len(open_map(tmp_path / "pointcloud_map").load()) == len(NAMES)
