@@ -313,9 +313,7 @@ class WebServer:
         tries, pause_s, began_s = 0, _FIRST_PAUSE_S, time.monotonic()
         while True:
             try:
-                return self._follow(
-                    name, method, target, {"User-Agent": "shmmap", **headers()}, take, _MAX_REDIRECTS
-                )
+                return self._follow(name, method, target, {"User-Agent": "shmmap", **headers()}, take)
             except _Failed as failed:
                 tries += 1
                 if tries > self._timeouts.retries or time.monotonic() - began_s > self._timeouts.retry_s:
@@ -324,15 +322,19 @@ class WebServer:
             pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
 
     def _follow(
-        self, name: str, method: str, target: str, headers: dict[str, str], take: _Take[_Answer], left: int
+        self, name: str, method: str, target: str, headers: dict[str, str], take: _Take[_Answer]
     ) -> _Answer:
-        """Make a request, and follow redirects within this server."""
-        try:
-            return self._once(name, method, target, headers, take)
-        except _Moved as moved:
-            if not left:
-                raise StoreRefused(f"{name}: refused, its redirects do not end") from None
-            return self._follow(name, method, moved.target, headers, take, left - 1)
+        """Make a request, and follow redirects within this server, which together have the time of one."""
+        limit_s = answer_limit_s(self._timeouts.read_s, 0)
+        end_s = time.monotonic() + limit_s
+        for _ in range(_MAX_REDIRECTS + 1):
+            try:
+                return self._once(name, method, target, headers, take)
+            except _Moved as moved:
+                target = moved.target
+            if time.monotonic() > end_s:
+                raise too_slow(name, limit_s)
+        raise StoreRefused(f"{name}: refused, its redirects do not end")
 
     def _once(
         self, name: str, method: str, target: str, headers: dict[str, str], take: _Take[_Answer]

@@ -205,6 +205,14 @@ def test_redirects_within_a_web_server_are_followed_to_their_end(web: FaultyWeb)
     web.fault = lambda _path: f"redirect {web.url}"
     assert "its redirects do not end" in outcome(lambda: opened(web, "http").get("CURRENT", 99))
 
+    def redirect_slowly(_path: str) -> str:
+        time.sleep(0.5)
+        return f"redirect {web.url}"
+
+    web.fault = redirect_slowly
+    store = opened(web, "http", Timeouts(connect_s=5.0, read_s=1.0, retries=0, retry_s=0.0))
+    assert f"{SLOW} 2 s" in outcome(lambda: store.get("CURRENT", 99))
+
 
 def test_a_body_that_was_cut_is_gone_on_with(web: FaultyWeb) -> None:
     web.fault = lambda _path: "stall body"
