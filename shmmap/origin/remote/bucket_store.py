@@ -118,6 +118,7 @@ _ASKED_FOR_CREDENTIALS: Final = (
 _BYTES_PER_PAGE: Final = 1 << 19
 _LEAST_BYTES: Final = 64 << 10
 _BYTES_RATIO: Final = 16
+"""Sizes for which a store is opened: the least, and the ratio of two."""
 _LATER_S: Final = 1.0
 _ELSEWHERE: Final = "the bucket is in another region"
 _CODE: Final = re.compile(r"<Code>(\w+)</Code>")
@@ -196,9 +197,10 @@ class BucketStore:
             most *= _BYTES_RATIO
         with self._opening:
             if (most, sends) not in self._opened:
-                limit_s = self._limit_s + _LATER_S + 2 * answer_limit_s(self._timeouts.read_s, most)
-                sending_s = answer_limit_s(0.0, most) if sends else 0.0
-                self._opened[most, sends] = self._open(limit_s, sending_s)
+                more_s = answer_limit_s(0.0, most)
+                self._opened[most, sends] = self._open(
+                    self._limit_s + more_s + _LATER_S, more_s if sends else 0.0
+                )
             return self._opened[most, sends]
 
     # --- reading --------------------------------------------------------------------------------
