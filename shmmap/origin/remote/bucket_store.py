@@ -72,6 +72,7 @@ _AGAIN: Final = "try again later"
 _SILENT: Final = "is the network up, and the address right? (s3:// has it of AWS_ENDPOINT_URL and AWS_REGION)"
 _REGION: Final = "is AWS_REGION that of the bucket?"
 _CERTIFICATE: Final = "SSL_CERT_FILE names further authorities; is the clock right?"
+_ADDRESS: Final = "is the address that of a store, and is there such a bucket?"
 _CLOCK: Final = "are the credentials valid, and is the clock right?"
 _PANIC: Final = "this is a defect: please report it, with what the log says before"
 _TRUE_NAMES: Final = (
@@ -501,7 +502,7 @@ def _out_of_reach(name: str, text: str) -> Offline:
         return NoBucket(f"{name}: there is no such bucket", status=404)
     found = _STATUS.search(text)
     status = int(found[1] or found[2]) if found is not None else 0
-    hint = _CLOCK if 400 <= status < 500 else _AGAIN
+    hint = _ADDRESS if status in (404, 405) else _CLOCK if 400 <= status < 500 else _AGAIN
     if why := _reason(text):
         hint = _HINTS.get(why, hint)
         return StoreRefused(f"{name}: refused, {why}", hint=hint, of_credentials=True, status=status)
