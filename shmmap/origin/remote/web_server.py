@@ -230,16 +230,22 @@ def _proxy_for(parts: urllib.parse.SplitResult) -> tuple[tuple[str, int] | None,
     named = proxies.get(parts.scheme.lower()) or proxies.get("all", "")
     if not named or urllib.request.proxy_bypass(parts.netloc):
         return None, {}
-    found = urllib.parse.urlsplit(named if "://" in named else f"http://{named}")
+    try:
+        found = urllib.parse.urlsplit(named if "://" in named else f"http://{named}")
+        port = found.port or 80
+    except ValueError:
+        raise _bad_proxy("it is no valid URL") from None
     if found.scheme != "http" or not found.hostname:
-        raise ConfigError(
-            "the proxy that the environment names cannot be used", hint="its URL has to begin with http://"
-        )
+        raise _bad_proxy("its URL has to begin with http://")
     headers = {}
     if found.username:
         user = f"{urllib.parse.unquote(found.username)}:{urllib.parse.unquote(found.password or '')}"
         headers["Proxy-Authorization"] = f"Basic {base64.b64encode(user.encode()).decode()}"
-    return (found.hostname, found.port or 80), headers
+    return (found.hostname, port), headers
+
+
+def _bad_proxy(why: str) -> ConfigError:
+    return ConfigError("the proxy that the environment names cannot be used", hint=why)
 
 
 _Take: TypeAlias = Callable[[str, http.client.HTTPResponse, _Clock], _Answer]

@@ -250,10 +250,11 @@ def test_a_proxy_of_the_environment_is_used(
     assert bytes(opened(web, "http").get("CURRENT", 99)) == TEXT
     assert web.requests() == [("m/CURRENT", 200)]
     monkeypatch.delenv("no_proxy")
-    monkeypatch.setenv("http_proxy", f"socks5://127.0.0.1:1/{SECRET}")
-    with pytest.raises(ConfigError, match="proxy that the environment names") as refused:
-        opened(web, "http")
-    assert SECRET not in str(refused.value)
+    for bad in ("socks5://127.0.0.1:1/", "http://127.0.0.1:", "http://["):
+        monkeypatch.setenv("http_proxy", f"{bad}{SECRET}")
+        with pytest.raises(ConfigError, match="proxy that the environment names") as refused:
+            opened(web, "http")
+        assert SECRET not in str(refused.value)
 
 
 # --- credentials that change while a program runs -----------------------------------------------------
