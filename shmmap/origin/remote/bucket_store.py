@@ -72,6 +72,7 @@ _AGAIN: Final = "try again later"
 _SILENT: Final = "is the network up, and the address right? (s3:// has it of AWS_ENDPOINT_URL and AWS_REGION)"
 _REGION: Final = "is AWS_REGION that of the bucket?"
 _CERTIFICATE: Final = "SSL_CERT_FILE names further authorities; is the clock right?"
+_ADDRESS: Final = "is the address that of a store, and is there such a bucket?"
 _CLOCK: Final = "are the credentials valid, and is the clock right?"
 _PANIC: Final = "this is a defect: please report it, with what the log says before"
 _TRUE_NAMES: Final = (
@@ -118,6 +119,7 @@ _ASKED_FOR_CREDENTIALS: Final = (
 _BYTES_PER_PAGE: Final = 1 << 19
 _LEAST_BYTES: Final = 64 << 10
 _BYTES_RATIO: Final = 16
+"""Sizes for which a store is opened: the least, and the ratio of two."""
 _LATER_S: Final = 1.0
 _ELSEWHERE: Final = "the bucket is in another region"
 _CODE: Final = re.compile(r"<Code>(\w+)</Code>")
@@ -196,9 +198,10 @@ class BucketStore:
             most *= _BYTES_RATIO
         with self._opening:
             if (most, sends) not in self._opened:
-                limit_s = self._limit_s + _LATER_S + 2 * answer_limit_s(self._timeouts.read_s, most)
-                sending_s = answer_limit_s(0.0, most) if sends else 0.0
-                self._opened[most, sends] = self._open(limit_s, sending_s)
+                more_s = answer_limit_s(0.0, most)
+                self._opened[most, sends] = self._open(
+                    self._limit_s + more_s + _LATER_S, more_s if sends else 0.0
+                )
             return self._opened[most, sends]
 
     # --- reading --------------------------------------------------------------------------------
@@ -499,7 +502,7 @@ def _out_of_reach(name: str, text: str) -> Offline:
         return NoBucket(f"{name}: there is no such bucket", status=404)
     found = _STATUS.search(text)
     status = int(found[1] or found[2]) if found is not None else 0
-    hint = _CLOCK if 400 <= status < 500 else _AGAIN
+    hint = _ADDRESS if status in (404, 405) else _CLOCK if 400 <= status < 500 else _AGAIN
     if why := _reason(text):
         hint = _HINTS.get(why, hint)
         return StoreRefused(f"{name}: refused, {why}", hint=hint, of_credentials=True, status=status)

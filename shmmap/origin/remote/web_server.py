@@ -230,16 +230,22 @@ def _proxy_for(parts: urllib.parse.SplitResult) -> tuple[tuple[str, int] | None,
     named = proxies.get(parts.scheme.lower()) or proxies.get("all", "")
     if not named or urllib.request.proxy_bypass(parts.netloc):
         return None, {}
-    found = urllib.parse.urlsplit(named if "://" in named else f"http://{named}")
+    try:
+        found = urllib.parse.urlsplit(named if "://" in named else f"http://{named}")
+        port = found.port or 80
+    except ValueError:
+        raise _bad_proxy("it is no valid URL") from None
     if found.scheme != "http" or not found.hostname:
-        raise ConfigError(
-            "the proxy that the environment names cannot be used", hint="its URL has to begin with http://"
-        )
+        raise _bad_proxy("its URL has to begin with http://")
     headers = {}
     if found.username:
         user = f"{urllib.parse.unquote(found.username)}:{urllib.parse.unquote(found.password or '')}"
         headers["Proxy-Authorization"] = f"Basic {base64.b64encode(user.encode()).decode()}"
-    return (found.hostname, found.port or 80), headers
+    return (found.hostname, port), headers
+
+
+def _bad_proxy(why: str) -> ConfigError:
+    return ConfigError("the proxy that the environment names cannot be used", hint=why)
 
 
 _Take: TypeAlias = Callable[[str, http.client.HTTPResponse, _Clock], _Answer]
@@ -313,9 +319,7 @@ class WebServer:
         tries, pause_s, began_s = 0, _FIRST_PAUSE_S, time.monotonic()
         while True:
             try:
-                return self._follow(
-                    name, method, target, {"User-Agent": "shmmap", **headers()}, take, _MAX_REDIRECTS
-                )
+                return self._follow(name, method, target, {"User-Agent": "shmmap", **headers()}, take)
             except _Failed as failed:
                 tries += 1
                 if tries > self._timeouts.retries or time.monotonic() - began_s > self._timeouts.retry_s:
@@ -324,15 +328,19 @@ class WebServer:
             pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
 
     def _follow(
-        self, name: str, method: str, target: str, headers: dict[str, str], take: _Take[_Answer], left: int
+        self, name: str, method: str, target: str, headers: dict[str, str], take: _Take[_Answer]
     ) -> _Answer:
-        """Make a request, and follow redirects within this server."""
-        try:
-            return self._once(name, method, target, headers, take)
-        except _Moved as moved:
-            if not left:
-                raise StoreRefused(f"{name}: refused, its redirects do not end") from None
-            return self._follow(name, method, moved.target, headers, take, left - 1)
+        """Make a request, and follow redirects within this server, which together have the time of one."""
+        limit_s = answer_limit_s(self._timeouts.read_s, 0)
+        end_s = time.monotonic() + limit_s
+        for _ in range(_MAX_REDIRECTS + 1):
+            try:
+                return self._once(name, method, target, headers, take)
+            except _Moved as moved:
+                target = moved.target
+            if time.monotonic() > end_s:
+                raise too_slow(name, limit_s)
+        raise StoreRefused(f"{name}: refused, its redirects do not end")
 
     def _once(
         self, name: str, method: str, target: str, headers: dict[str, str], take: _Take[_Answer]

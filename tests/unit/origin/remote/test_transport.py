@@ -116,10 +116,14 @@ def test_a_bucket_s_other_answers_have_their_names(web: FaultyWeb) -> None:
         assert says in outcome(lambda: list(store.list("versions/"))), fault
     for fault, says in (("page", "no ETag"), ("continue", "no answer in time"), ("drip error", SLOW)):
         assert says in outcome(lambda: store.put("blobs/sha256/aa", b"1")), fault
-    fault = "503"
-    with pytest.raises(StoreRefused, match="status 503") as refused:
-        store.get("CURRENT", 99)
-    assert refused.value.hint == "try again later"
+    for fault, hint in (
+        ("503", "try again later"),
+        ("404", "is the address that of a store"),
+        ("400", "clock"),
+    ):
+        with pytest.raises(StoreRefused, match=f"status {fault}") as refused:
+            list(store.list("versions/"))
+        assert hint in refused.value.hint
 
 
 ODD_ANSWERS = {
@@ -205,6 +209,14 @@ def test_redirects_within_a_web_server_are_followed_to_their_end(web: FaultyWeb)
     web.fault = lambda _path: f"redirect {web.url}"
     assert "its redirects do not end" in outcome(lambda: opened(web, "http").get("CURRENT", 99))
 
+    def redirect_slowly(_path: str) -> str:
+        time.sleep(0.5)
+        return f"redirect {web.url}"
+
+    web.fault = redirect_slowly
+    store = opened(web, "http", Timeouts(connect_s=5.0, read_s=1.0, retries=0, retry_s=0.0))
+    assert f"{SLOW} 2 s" in outcome(lambda: store.get("CURRENT", 99))
+
 
 def test_a_body_that_was_cut_is_gone_on_with(web: FaultyWeb) -> None:
     web.fault = lambda _path: "stall body"
@@ -238,10 +250,11 @@ def test_a_proxy_of_the_environment_is_used(
     assert bytes(opened(web, "http").get("CURRENT", 99)) == TEXT
     assert web.requests() == [("m/CURRENT", 200)]
     monkeypatch.delenv("no_proxy")
-    monkeypatch.setenv("http_proxy", f"socks5://127.0.0.1:1/{SECRET}")
-    with pytest.raises(ConfigError, match="proxy that the environment names") as refused:
-        opened(web, "http")
-    assert SECRET not in str(refused.value)
+    for bad in ("socks5://127.0.0.1:1/", "http://127.0.0.1:", "http://["):
+        monkeypatch.setenv("http_proxy", f"{bad}{SECRET}")
+        with pytest.raises(ConfigError, match="proxy that the environment names") as refused:
+            opened(web, "http")
+        assert SECRET not in str(refused.value)
 
 
 # --- credentials that change while a program runs -----------------------------------------------------
