@@ -21,6 +21,7 @@ from shmmap.installed import remember_modules
 from shmmap.lazy_imports import know_names
 from shmmap.protocol import messages
 from shmmap.protocol.messages import Welcome
+from shmmap.segment.process_limits import no_files_left
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -569,7 +570,12 @@ def connect(
     BadRequest
         The endpoint cannot be a socket path, or another argument is invalid.
     """
-    _load_all()
+    try:
+        _load_all()
+    except (OSError, ImportError) as error:
+        if no_files_left(error) is None:
+            raise
+        # the connection needs more descriptors than a module, and its error says how many
     return Client(
         candidates(endpoint, instance=instance),
         timeout=timeout_s("timeout", timeout),

@@ -418,7 +418,8 @@ def test_a_mapper_says_that_the_disk_is_full_and_goes_on_when_there_is_room(
                     taken.append(mapper.applied)
                 mapper.wait_applied()
 
-            with pytest.raises(Busy, match=r"live map lidar: a scan waits: .*No space left on device"):
+            # on a busy machine the daemon may be slower than the mapper's timeout: then that error says why
+            with pytest.raises((Busy, NoAnswer), match=r"live map lidar.* waits: .*No space left on device"):
                 add_all()
             assert len(taken) > 3
             with pytest.raises(Busy, match="No space left on device"):
