@@ -90,7 +90,7 @@ def test_signals_end_what_waits_for_a_store(
         is_object = path.startswith(f"{TOWN}/blobs/")
         if fault == "objects":
             asked.extend([path] * is_object)
-            return "drip body" if len(asked) > 2 else ""  # root and shard come
+            return "drip head" if len(asked) > 2 else ""  # root and shard come
         asked.append(path)
         return fault
 
