@@ -40,7 +40,8 @@ class CompilingLines:
         """Print a line, unless the last one was a moment ago."""
         if (now_s := time.monotonic()) >= self._due_s:
             self._due_s = now_s + _PAUSE_S
-            part = (module.split(".") * 2)[1]
+            _, _, below = module.partition(".")
+            part = below.partition(".")[0] or module  # such as layers, of shmmap.layers.kernels
             _say(f"{self._name}: compiling kernels, once for this version: {part}, {number} of {of}")
 
 
