@@ -44,7 +44,8 @@ Errors
 
 More
     `shmmap.layers` (layers without a daemon, custom kinds), `shmmap.live` (live maps),
-    `shmmap.events` (events of the daemon), `shmmap.testing` (a daemon for tests).
+    `shmmap.events` (events of the daemon), `shmmap.aio` (a client for asyncio), `shmmap.testing` (a daemon
+    for tests).
 
 Every name is loaded at its first use, so that ``import shmmap`` itself takes almost no time.
 """

@@ -11,8 +11,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Bounds", "ColumnSpec", "column_names", "row_extremes"]
-
 
 @dataclass(frozen=True, slots=True)
 class ColumnSpec:

@@ -10,8 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TypeAlias
 
-__all__ = ["log_first", "notice", "watch"]
-
 Watcher: TypeAlias = Callable[[str, int, int], None]
 """Called before a kernel is compiled, with its module, its number there, and how many the module has."""
 

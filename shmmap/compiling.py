@@ -28,8 +28,6 @@ from shmmap.compile_notices import notice
 from shmmap.kernel_cache import discard, read_kernel, write_kernel
 from shmmap.version import __version__
 
-__all__ = ["compiled", "inlined", "read_only"]
-
 F = TypeVar("F", bound=Callable[..., Any])
 
 _VERSIONS: Final = (__version__, numba.__version__, llvmlite.__version__)

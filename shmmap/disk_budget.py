@@ -28,8 +28,6 @@ from typing import Final
 from shmmap.failpoints import step
 from shmmap.private_directory import why_not_private
 
-__all__ = ["CELLS", "INDEX", "INTERIM", "LAYERS", "OBJECTS", "DiskBudget", "mark_used"]
-
 LAYERS: Final = "layers"
 OBJECTS: Final = "objects"
 CELLS: Final = "cells"

@@ -14,8 +14,6 @@ from __future__ import annotations
 import os
 from typing import Final
 
-__all__ = ["CLIENT_STEPS", "DAEMON_STEPS", "LIVE_STEPS", "ORIGIN_STEPS", "WORKER_STEPS", "step"]
-
 WORKER_STEPS: Final = (
     "worker.alloc",
     "worker.write",
@@ -50,7 +48,6 @@ LIVE_STEPS: Final = (
     "live.even",
     "live.map",
     "live.written",
-    "live.synced",
     "live.renamed",
     "live.flushed",
 )

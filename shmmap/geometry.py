@@ -22,17 +22,6 @@ if TYPE_CHECKING:
     Floats: TypeAlias = NDArray[np.float64]
     Mask: TypeAlias = NDArray[np.bool_]
 
-__all__ = [
-    "Area",
-    "AutowareSquare",
-    "Box",
-    "Circle",
-    "checked_heights",
-    "distance_to_boxes",
-    "heights_overlap",
-]
-
-
 _R = TypeVar("_R", bound="_Round")
 
 

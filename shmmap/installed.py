@@ -22,17 +22,6 @@ from typing import Final
 
 from shmmap.errors import Replaced
 
-__all__ = [
-    "OURS",
-    "RESTART",
-    "is_installed",
-    "is_replaced",
-    "mark",
-    "refuse_if_replaced",
-    "remember_modules",
-    "was_noticed",
-]
-
 RESTART: Final = "shmmap was replaced: restart the daemon"
 
 OURS: Final = ("shmmap", "shmmap_clients")

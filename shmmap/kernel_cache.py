@@ -29,16 +29,6 @@ from shmmap.logfmt import log
 from shmmap.private_directory import PRIVATE, NotPrivate, opened_private, why_not_own
 from shmmap.version import __version__
 
-__all__ = [
-    "all_kept",
-    "are_compiled",
-    "compiled_mark",
-    "discard",
-    "kernel_directory",
-    "read_kernel",
-    "write_kernel",
-]
-
 _MAGIC: Final = b"SHMMAPK\x01"
 _MAX_BYTES: Final = 64 << 20  # the largest kernel has a few hundred kB
 _ABANDONED_S: Final = 3600.0

@@ -20,23 +20,10 @@ if TYPE_CHECKING:
     from shmmap.protocol.live import LackingChunk
     from shmmap.protocol.messages import Holder, Welcome
 
-__all__ = [
-    "area_text",
-    "empty_layers",
-    "extent_text",
-    "failure_lines",
-    "judge",
-    "near_cells_hint",
-    "no_cell_there",
-    "not_covered",
-    "pending_lines",
-    "unknown_ids",
-    "warn_of_lost_chunks",
-]
-
 _NOT_COVERED: Final = "the daemon does not know yet all that the map has there"
 _OUT_OF_REACH: Final = "the list of cells there cannot be reached at present"
 _WAIT_LONGER: Final = "ask again, or wait longer: wait=SECONDS"
+PREPARE_HINT: Final = "`shmmap prepare` or the setting prepare computes layers ahead of time"
 _NAMED_CELLS: Final = 3
 _NAMED_CHUNKS: Final = 5
 _MAX_CELLS: Final = 20_000  # searching them for similar ids takes at most a second
@@ -45,10 +32,10 @@ _MAX_LINES: Final = 10  # of a warning
 _Bounds = tuple[float, float, float, float]
 
 
-def judge(
+def verdict(
     client: Client, found: CellSet, area: Area | None, *, waited: bool, strict: bool, new: bool = True
-) -> None:
-    """Report missing cells of an answer: as a `ShmmapWarning` at the program's call, or as an error.
+) -> str:
+    """Return what a `ShmmapWarning` should say of an answer's missing cells, if anything; or raise an error.
 
     Parameters
     ----------
@@ -71,7 +58,7 @@ def judge(
     if strict:
         if (error := _error_of(client, found, area, new)) is not None:
             raise error
-        return
+        return ""
     lines = failure_lines(found.failed)
     if waited:
         lines += pending_lines(found.pending)
@@ -83,14 +70,14 @@ def judge(
         nothing = _nothing(client, found, area)
         lines += [f"{message} ({hint})" if hint else message for message, hint in nothing]
     if not lines:
-        return
+        return ""
     if len(lines) > _MAX_LINES:
         lines[_MAX_LINES:] = [f"... and {len(lines) - _MAX_LINES} more"]
     if found.pending and waited:
-        lines.append(f"hint: what is pending is still being loaded: {_WAIT_LONGER}")
+        lines.append(f"hint: what is pending is still being loaded: {_wait_longer(found.pending)}")
     if found.failed or (found.pending and waited):
         lines.insert(0, f"{len({cell.id for cell in found}):,} of {_asked(found):,} cells are there:")
-    warn_program("\n".join(lines))
+    return "\n".join(lines)
 
 
 def warn_of_lost_chunks(name: str, lacking: Sequence[LackingChunk], count: int) -> None:
@@ -119,7 +106,7 @@ def _error_of(client: Client, found: CellSet, area: Area | None, new: bool) -> S
             f"{first.id} ({first.layer}): still being loaded" + (f", and {more} more" if more else ""),
             cell_id=first.id,
             layer=first.layer,
-            hint=_WAIT_LONGER,
+            hint=_wait_longer(found.pending),
         )
     if not found.covered:
         message, hint = not_covered(found)
@@ -151,6 +138,12 @@ def _asked(found: CellSet) -> int:
     ids.update(cell.id for cell in found.pending)
     ids.update(error.cell_id for error in found.failed)
     return len(ids)
+
+
+def _wait_longer(pending: Iterable[PendingLayer]) -> str:
+    """Return what to do about layers that are still being loaded."""
+    computed = any(one.layer != "points" for one in pending)
+    return f"{_WAIT_LONGER}; {PREPARE_HINT}" if computed else _WAIT_LONGER
 
 
 # --- failed and pending -------------------------------------------------------------------------------

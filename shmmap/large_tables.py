@@ -12,12 +12,6 @@ from typing import Any, Final, TypeVar, overload
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-__all__ = [
-    "ShardedDict",
-    "sparse_zeros",
-]
-
-
 K = TypeVar("K", bound=Hashable)
 V = TypeVar("V")
 T = TypeVar("T")

@@ -19,16 +19,6 @@ from shmmap.errors import PackageMissing
 from shmmap.installed import OURS, refuse_if_replaced
 from shmmap.segment.process_limits import no_files_left
 
-__all__ = [
-    "FOR_REMOTE",
-    "TO_SIGN",
-    "know_names",
-    "lazy_names",
-    "lazy_public_names",
-    "needed_packages",
-    "public_names",
-]
-
 FOR_REMOTE: Final = "obstore zstandard"
 """Packages for a published map: the extra ``remote``."""
 TO_SIGN: Final = "tuf 'securesystemslib[crypto]'"
@@ -45,7 +35,19 @@ _PACKAGES: Final = {
 """Packages whose name differs from that of their module."""
 
 _OPTIONAL: Final = frozenset(
-    {"cyclonedds", "laspy", "obstore", "pyopencl", "securesystemslib[crypto]", "tifffile", "tuf", "zstandard"}
+    {
+        "cyclonedds",
+        "laspy",
+        "obstore",
+        "pyopencl",
+        "rosbags",
+        "securesystemslib[crypto]",
+        "tifffile",
+        "tuf",
+        "viser",
+        "websockets",
+        "zstandard",
+    }
 )
 """Packages that an ordinary installation lacks: `project.optional-dependencies`."""
 

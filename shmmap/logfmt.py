@@ -14,12 +14,12 @@ The daemon's log goes to stderr: with journald's priorities under systemd, with 
 
 from __future__ import annotations
 
+import io
 import logging
 import os
+import select
 import sys
-from typing import Any, Final
-
-__all__ = ["escaped", "log", "logfmt", "set_up_logging"]
+from typing import TYPE_CHECKING, Any, Final, TextIO
 
 _ESCAPES = {"\n": "\\n", "\t": "\\t", "\r": "\\r"}
 
@@ -124,9 +124,54 @@ class _JournalLines(_Lines):
         return prefix + super().format(record).replace("\n", "\n" + prefix)
 
 
+if TYPE_CHECKING:
+    _StreamHandler = logging.StreamHandler[TextIO]
+else:
+    _StreamHandler = logging.StreamHandler  # before Python 3.11 it takes no parameter
+
+
+class _Lossy(_StreamHandler):
+    """Handler that leaves lines out, and says how many, where nothing reads them.
+
+    A stopped terminal or a pipe that is full would hold up the process, and all its clients.
+    """
+
+    _PART_CHARS: Final = 1000  # at most 4000 bytes: what poll(2) promises of a pipe
+    _WAIT_MS: Final = 20  # for a reader that is only slow
+
+    def __init__(self, stream: TextIO) -> None:
+        super().__init__(stream)
+        self._left_out = 0
+
+    def emit(self, record: logging.LogRecord) -> None:
+        try:
+            text = self.format(record) + "\n"
+            if self._left_out and self._is_writable():
+                missed, self._left_out = self._left_out, 0
+                note = logfmt("log lines left out: nothing read them", count=missed)
+                self.emit(logging.LogRecord(record.name, logging.WARNING, "", 0, note, None, None))
+            for begin in range(0, len(text), self._PART_CHARS):
+                if not self._is_writable():
+                    self._left_out += 1
+                    return
+                self.stream.write(text[begin : begin + self._PART_CHARS])
+                self.flush()
+        except (OSError, ValueError):
+            self.handleError(record)
+
+    def _is_writable(self) -> bool:
+        try:
+            stream = self.stream.fileno()
+        except io.UnsupportedOperation:
+            return True  # memory
+        poll = select.poll()
+        poll.register(stream, select.POLLOUT)
+        return bool(poll.poll(0 if self._left_out else self._WAIT_MS))
+
+
 def set_up_logging(level: int = logging.INFO) -> None:
     """Send the daemon's log to stderr, in the form its reader expects."""
-    handler = logging.StreamHandler(sys.stderr)
+    handler = _Lossy(sys.stderr)
     if os.environ.get("JOURNAL_STREAM"):
         handler.setFormatter(_JournalLines("%(message)s"))
     else:

@@ -9,9 +9,13 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
-__all__ = ["Mount", "control_groups", "group_values", "mount_of", "mounts"]
+REMOTE: Final = (
+    *("nfs", "nfs4", "cifs", "smb3", "9p", "ceph", "lustre", "glusterfs", "afs"),
+    *("fuse.sshfs", "fuse.glusterfs"),
+)
+"""Types of file systems that other machines change as well."""
 
 
 class Mount(NamedTuple):

@@ -8,8 +8,6 @@ from typing import Any, Final
 
 from shmmap.errors import PackageMissing, ShmmapError
 
-__all__ = ["SYSTEM_PACKAGES", "load_open3d"]
-
 SYSTEM_PACKAGES: Final = (
     "libegl1", "libgl1", "libx11-6", "libusb-1.0-0", "libgomp1",
     *(() if os.uname().machine == "x86_64" else ("libgfortran5",)),  # Open3D for other machines links to it

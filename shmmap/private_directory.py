@@ -16,22 +16,6 @@ import stat
 from collections.abc import Iterator
 from typing import Final
 
-__all__ = [
-    "CLOSED",
-    "DIRECTORY_FLAGS",
-    "PRIVATE",
-    "UNWRITABLE",
-    "NotPrivate",
-    "open_followed",
-    "open_own",
-    "open_private",
-    "opened_private",
-    "require_private",
-    "why_not_own",
-    "why_not_private",
-    "within",
-]
-
 PRIVATE: Final = 0o700
 """Mode of a directory for this user alone."""
 UNWRITABLE: Final = 0o022

@@ -5,8 +5,6 @@ from __future__ import annotations
 
 from typing import Protocol
 
-__all__ = ["NoProgress", "Progress"]
-
 
 class Progress(Protocol):
     """Receives the progress of work on points, cells or objects.

@@ -5,8 +5,6 @@ from __future__ import annotations
 
 from datetime import datetime, timezone
 
-__all__ = ["counted", "format_bytes", "format_duration", "format_metres", "format_utc"]
-
 
 def counted(count: int, noun: str) -> str:
     """Return a count with its noun: ``"1 cell"``, ``"2,400 cells"``."""

@@ -10,8 +10,6 @@ from __future__ import annotations
 import os
 from functools import cache
 
-__all__ = ["__version__", "build_version"]
-
 __version__ = "0.3.0"
 
 _DIGITS = 8

@@ -7,8 +7,6 @@ import contextlib
 import threading
 from collections.abc import Iterator
 
-__all__ = ["WorkRoom"]
-
 
 class WorkRoom:
     """Bytes that threads take for pieces of work, and wait for; thread-safe.

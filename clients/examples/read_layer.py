@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read a layer: the mean of the points in each voxel of half a metre, around a place.
+"""Read a layer with its units: the mean of the points in each voxel of half a metre, around a place.
 
     python3 read_layer.py X Y RADIUS                  # metres, map frame
 
@@ -30,8 +30,10 @@ def main() -> int:
             low, high = means.min(axis=0) + cell.origin, means.max(axis=0) + cell.origin
             print(
                 f"{cell.id}: {len(means)} voxels of {counts.sum()} points, from {np.round(low, 2)}"
-                f" to {np.round(high, 2)} m; columns {', '.join(cell.column_names)}"
+                f" to {np.round(high, 2)} m"
             )
+            for name in cell.column_names:  # LAYERS.md says what each one is
+                print(f"  {name}: {cell[name].dtype}, {cell[name].shape}, unit {cell.unit(name) or 'none'}")
     return 0
 
 

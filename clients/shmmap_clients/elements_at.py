@@ -13,8 +13,6 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-__all__ = ["float32_at", "float64_at", "int32_at"]
-
 
 def _element_of(result: types.Type, llvm_type: ir.Type) -> Any:
     @intrinsic

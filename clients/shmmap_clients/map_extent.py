@@ -7,8 +7,6 @@ from collections.abc import Iterable, Sequence
 
 from shmmap import Client, ShmmapError
 
-__all__ = ["NoMapHere", "extent_text", "map_extent"]
-
 
 class NoMapHere(ShmmapError):
     """The map has no cells around the requested position."""

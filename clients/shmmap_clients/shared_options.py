@@ -19,37 +19,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from shmmap_clients.ndt_scan_matcher import DeviceOptions, TrustLimits
+    from shmmap_clients.scans.bag_scans import BagOptions
     from shmmap_clients.scans.bin_layout import BinLayout
     from shmmap_clients.scans.scan_file import ScanReader
-
-__all__ = [
-    "FAILED_LIMITS",
-    "Parser",
-    "add_backend_option",
-    "add_device_options",
-    "add_height_option",
-    "add_json_lines_option",
-    "add_leaf_option",
-    "add_min_range_option",
-    "add_pose_format_option",
-    "add_pose_option",
-    "add_poses_option",
-    "add_quiet_option",
-    "add_radius_option",
-    "add_scan_option",
-    "add_scans_option",
-    "add_scoring_options",
-    "add_sigma_options",
-    "add_thin_option",
-    "add_threads_option",
-    "add_trust_options",
-    "device_options_from",
-    "pose_from",
-    "pose_text",
-    "reader_from",
-    "scoring_settings",
-    "trust_from",
-]
 
 Parser = argparse.ArgumentParser | argparse._ArgumentGroup
 FAILED_LIMITS: Final = """\
@@ -62,27 +34,33 @@ _FORMATS: Final = {"rpy": _POSE, "tum": "X,Y,Z,QX,QY,QZ,QW", "xyyaw": "X,Y,YAW"}
 
 
 def add_scan_option(parser: Parser) -> None:
-    """Add ``--scan``, a file for `shmmap_clients.scans.scan_file`, and the options of reading it."""
+    """Add ``--scan``, see `shmmap_clients.scan_drive.read_one_scan`, and the options of reading it."""
     parser.add_argument(
         "--scan",
         required=True,
-        metavar="FILE",
-        help="scan: PCD, NPZ (xyz or xyz_4mm), or bare rows in a .bin",
+        metavar="FILE|BAG@SECONDS",
+        help="scan: PCD, NPZ (xyz or xyz_4mm), or bare rows in a .bin; or that of a bag (rosbag2) nearest to"
+        " a time since its begin",
     )
     _add_bin_option(parser)
+    _add_bag_options(parser)
     add_min_range_option(parser)
 
 
-def add_scans_option(parser: Parser, *, min_range: bool = True) -> None:
-    """Add ``--scans``, see `shmmap_clients.scan_drive.open_scans`, and the options of reading them."""
+def add_scans_option(parser: Parser, *, min_range: bool = True, live: bool = False) -> None:
+    """Add ``--scans``, see `shmmap_clients.scan_drive.open_scans`, and the options of reading them.
+
+    ``live``: without it, ``--topic`` is a topic of the running system.
+    """
     parser.add_argument(
         "--scans",
-        required=True,
-        metavar="DIR|ENDPOINT",
-        help="scans: a directory (PCD, NPZ, .bin; in the order of their names), or the ZeroMQ address of a"
-        " publisher",
+        required=not live,
+        metavar="DIR|BAG|ENDPOINT",
+        help="scans: a directory (PCD, NPZ, .bin; in the order of their names), a bag (rosbag2: a directory,"
+        " .db3 or .mcap), or the ZeroMQ address of a publisher",
     )
     _add_bin_option(parser)
+    _add_bag_options(parser)
     if min_range:
         add_min_range_option(parser)
 
@@ -91,9 +69,10 @@ def add_poses_option(parser: Parser) -> None:
     """Add ``--poses``."""
     parser.add_argument(
         "--poses",
-        metavar="FILE",
-        help="poses of the frame that the points are in, for the scans of a directory, TUM format; a"
-        " publisher's scans bring theirs",
+        metavar="FILE|TOPIC",
+        help="poses of the frame that the points are in, for the scans of a directory, TUM format; for a bag"
+        " those of its --base-frame, TUM format or their topic (default: the only one in the map's frame,"
+        " else /tf); a publisher's scans bring theirs",
     )
 
 
@@ -112,6 +91,26 @@ def _add_bin_option(parser: Parser) -> None:
         help="columns of .bin files, such as x,y,z,intensity,ring: float32, or as x:f8,y,z,t:u4 says; _ skips"
         " one (default: recognised by their numbers, and said)",
     )
+
+
+def _add_bag_options(parser: Parser) -> None:
+    parser.add_argument(
+        "--topic", metavar="TOPIC", help="clouds of a bag (default: its only topic of PointCloud2)"
+    )
+    parser.add_argument(
+        "--base-frame",
+        default="base_link",
+        metavar="FRAME",
+        help="frame of the vehicle: poses of a bag are of it, and scans are transformed to it by /tf_static"
+        " (of shmmap-rolling they stay in the scanner's; default: base_link)",
+    )
+
+
+def bag_options_from(args: argparse.Namespace, **settings: Any) -> BagOptions:
+    """Return what is taken from a bag: the options, and a program's ``settings`` of `BagOptions`."""
+    from shmmap_clients.scans.bag_scans import BagOptions
+
+    return BagOptions(args.topic, args.base_frame, **settings)
 
 
 def _bin_layout(text: str) -> BinLayout:

@@ -9,8 +9,6 @@ from typing import Final, Generic, TypeVar
 
 import numpy as np
 
-__all__ = ["KEPT", "Decimated", "RunningSpread", "Spread"]
-
 KEPT: Final = 4096
 
 T = TypeVar("T")

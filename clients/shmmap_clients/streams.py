@@ -12,8 +12,6 @@ import zmq
 
 from shmmap import BadRequest
 
-__all__ = ["Publisher", "Subscriber", "is_endpoint"]
-
 _REPEAT_MS: Final = 100  # between two repetitions of the end
 
 _Self = TypeVar("_Self", bound="_Endpoint")

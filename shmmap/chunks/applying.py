@@ -34,8 +34,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = ["UNDO_BYTES", "ChunkWriter", "UndoRecord"]
-
 _MAGIC: Final = b"SHMUNDO\0"
 _UNDO: Final = struct.Struct("<8sQQ3iI")
 _IN_FORCE_AT: Final = 8

@@ -13,8 +13,6 @@ from numba.extending import intrinsic
 from shmmap.chunks.voxels import BRICK_VOXELS
 from shmmap.compiling import compiled, read_only
 
-__all__ = ["add_evidence", "begin_writing", "end_writing", "touched_bricks"]
-
 _ONE: Final = np.uint64(1)
 _trailing_zeros: Any = numbers.trailing_zeros
 

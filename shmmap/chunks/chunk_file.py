@@ -33,19 +33,6 @@ from shmmap.lazy_imports import needed_packages
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = [
-    "CHUNK_FILE_VERSION",
-    "CODECS",
-    "FILE_HEADER_BYTES",
-    "ChunkFileHeader",
-    "check_file",
-    "check_identity",
-    "decode_chunk",
-    "encode_chunk",
-    "read_file_header",
-    "usual_codec",
-]
-
 CHUNK_FILE_VERSION: Final = (1, 0)
 CODECS: Final = {"raw": 0, "zstd": 1, "zlib": 2}
 """Compressions of a file's body, with their numbers in the header."""

@@ -22,22 +22,6 @@ from shmmap.errors import SegmentCorrupt
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = [
-    "BRICK_BYTES",
-    "CHUNKS_VERSION",
-    "HEADER_BYTES",
-    "MAPPERS",
-    "MAX_BYTES",
-    "OUT_OF_SERVICE",
-    "STATE_AT",
-    "ChunkIdentity",
-    "ChunkView",
-    "check_consistent",
-    "chunk_bytes",
-    "new_header",
-    "read_identity",
-]
-
 CHUNKS_VERSION: Final = (2, 0)
 MAJORS_READ: Final = (1, 2)
 """Readable major versions, with the same layout; a daemon of version 1 did not truncate evicted chunks."""

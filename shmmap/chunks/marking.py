@@ -23,8 +23,6 @@ from shmmap.errors import BadRequest, ConfigError
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["Marker"]
-
 FIRST_SLOTS: Final = 64
 MAX_REACH: Final = 64
 """Most chunks from the sensor to the end of the longest ray; the window's table then has 9 MB."""

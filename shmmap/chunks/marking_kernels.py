@@ -23,8 +23,6 @@ from shmmap.compiling import compiled, inlined, read_only
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["NO_SLOTS", "count_words", "mark_ends", "mark_rays", "window_codes", "write_words"]
-
 NO_SLOTS: Final = -1
 _ZERO: Final = np.uint64(0)
 _ONE: Final = np.uint64(1)

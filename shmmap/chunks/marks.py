@@ -18,8 +18,6 @@ from shmmap.errors import BadRequest
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["MARKS_VERSION", "MAX_CHUNKS", "Marks", "decode_marks", "encode_marks", "marks_bytes"]
-
 MARKS_VERSION: Final = (1, 0)
 MAX_CHUNKS: Final = 4096
 """Most chunks that one scan may touch."""

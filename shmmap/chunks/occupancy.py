@@ -15,8 +15,6 @@ import msgspec
 
 from shmmap.errors import ConfigError
 
-__all__ = ["UNIT", "Occupancy", "ScanCounts", "ScanFilter", "log_odds", "probability"]
-
 UNIT: Final = 1000
 NEAREST: Final = 1e-9
 """Minimum distance of a probability from 0 and 1; beyond that its log-odds do not fit."""

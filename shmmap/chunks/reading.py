@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = ["KINDS", "read_chunk", "select_voxels", "sequence_of"]
-
 KINDS: Final = ("occupied", "free")
 TRIES: Final = 1000
 """Tries for one copy: a write takes 40 us, but after a writer's death the sequence may stay odd."""

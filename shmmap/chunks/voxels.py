@@ -20,21 +20,6 @@ if TYPE_CHECKING:
 
     Indices: TypeAlias = NDArray[np.int32]
 
-__all__ = [
-    "BRICKS",
-    "BRICK_VOXELS",
-    "CHUNK_SIDE",
-    "CHUNK_VOXELS",
-    "FURTHEST_INDEX",
-    "FURTHEST_SENSOR",
-    "WORDS",
-    "ChunkKey",
-    "in_chunk",
-    "voxel_centers",
-    "voxel_indices",
-    "voxels_of",
-]
-
 CHUNK_SHIFT: Final = 6
 CHUNK_SIDE: Final = 1 << CHUNK_SHIFT
 """Voxels along each edge of a chunk."""

@@ -22,20 +22,6 @@ if TYPE_CHECKING:
     from shmmap.geometry import Area
     from shmmap.protocol.messages import Evicted, Pinned
 
-__all__ = [
-    "BoxTuple",
-    "act_on_cells",
-    "add_area_options",
-    "add_area_or_ids",
-    "add_cells_argument",
-    "area_from",
-    "around",
-    "moved_by",
-    "no_cell_there",
-    "print_near_cells",
-    "those_in",
-]
-
 BoxTuple = tuple[float, float, float, float]
 Answer = TypeVar("Answer", "Evicted", "Pinned")
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lines on stderr that say that kernels are being compiled, by this process or by the daemon it waits for."""
+"""Lines on stderr about what takes long: kernels being compiled, here or by the daemon, and layers there."""
 
 from __future__ import annotations
 
@@ -7,20 +7,22 @@ import contextlib
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from shmmap.errors import ShmmapError
+from shmmap.lacking import PREPARE_HINT
+from shmmap.quantities import counted
 
 if TYPE_CHECKING:
     from shmmap.client.client import Client
     from shmmap.statistics.reader import Snapshot
 
-__all__ = ["CompilingLines", "saying_what_the_daemon_compiles"]
-
 _PAUSE_S: Final = 5.0
 _LOOK_S: Final = 0.5
+_LONG_S: Final = 3.0
+"""How long a wait is until it is said how far the daemon is."""
 
 
 class CompilingLines:
@@ -46,8 +48,8 @@ class CompilingLines:
 
 
 @contextlib.contextmanager
-def saying_what_the_daemon_compiles(client: Client) -> Iterator[None]:
-    """Print a line if the daemon compiles kernels while the block waits for layers."""
+def saying_what_the_daemon_does(client: Client) -> Iterator[None]:
+    """Print what the daemon does while the block waits for layers: compiling kernels, then how far it is."""
     from shmmap.statistics.reader import read_statistics
 
     ended = threading.Event()
@@ -62,14 +64,29 @@ def saying_what_the_daemon_compiles(client: Client) -> Iterator[None]:
 
 
 def _look(read: Callable[[], Snapshot], ended: threading.Event) -> None:
+    began: Mapping[str, int] | None = None
+    compiles, hinted, due_s = False, False, time.monotonic() + _LONG_S
     while not ended.wait(_LOOK_S):
         try:
-            found = read()
+            counts = read().counters
         except (ShmmapError, OSError):
             return
-        if found.counters.get("loaders_compiling", 0):
+        began = began or counts
+        if counts.get("loaders_compiling", 0) and not compiles:
+            compiles = True
             _say("shmmap: the daemon compiles kernels for this layer, once for this version")
-            return
+        now_s = time.monotonic()
+        if now_s < due_s or compiles:
+            continue
+        due_s = now_s + _PAUSE_S
+        loaded, computed = (counts[name] - began[name] for name in ("loads_finished", "layers_computed"))
+        _say(
+            f"shmmap: {counted(loaded, 'load')} done, {computed:,} computed, {counts['load_queue']:,} waiting"
+            f" for {counted(counts['workers'], 'loader')}"
+        )
+        if computed and not hinted:
+            hinted = True
+            _say(f"hint: {PREPARE_HINT}")
 
 
 def _say(line: str) -> None:

@@ -7,16 +7,15 @@ import argparse
 import os
 from typing import TYPE_CHECKING, Final
 
-from shmmap.errors import NoSocket, ProtocolMismatch, ShmmapError
+from shmmap.errors import NoAnswer, NoSocket, ProtocolMismatch, ShmmapError
 from shmmap.protocol.endpoint import DEFAULT_INSTANCE, endpoint_path, runtime_dirs, socket_path
 from shmmap.segment.names import usual_directory
 
 if TYPE_CHECKING:
     from shmmap.client.client import Client
+    from shmmap.doctor.daemon_lists import DaemonLists
     from shmmap.statistics.identity import DaemonIdentity
     from shmmap.statistics.reader import Snapshot
-
-__all__ = ["connect", "endpoint", "has_lost_socket", "instance", "locate", "shm_dir", "snapshot"]
 
 ASKED_S: Final = 2.0
 """Seconds that a verb waits for the owner of a socket to identify itself."""
@@ -162,6 +161,31 @@ def snapshot(args: argparse.Namespace) -> tuple[Snapshot, DaemonIdentity]:
     return found, found.identity
 
 
+def lists(args: argparse.Namespace, name: str = "shmmap") -> DaemonLists:
+    """Return what asks the daemon for its clients and live maps, which its statistics lack."""
+    from shmmap.doctor.daemon_lists import DaemonLists
+
+    return DaemonLists(name, endpoint(args))
+
+
+def connect_to(args: argparse.Namespace, found: Snapshot) -> Client:
+    """Connect to the daemon whose statistics were found, for what only it can list.
+
+    Raises
+    ------
+    NoAnswer
+        It is paused, starting or dead.
+    """
+    from shmmap.doctor.daemon_lists import socket_of
+    from shmmap.doctor.verdicts import state_problem
+
+    problem = state_problem(found)
+    if problem is not None and found.state != "hung":  # one that cannot write its statistics looks hung
+        raise NoAnswer(f"the daemon does not answer. {problem.fact}", hint=problem.advice)
+    path = socket_of(found.identity, endpoint(args)) if found.identity is not None else None
+    return _connected(args, path, "shmmap")
+
+
 def has_lost_socket(found: Snapshot) -> bool:
     """Whether another program removed the socket of a running daemon, so that clients cannot find it."""
     from shmmap.statistics.identity import pid_namespace
@@ -205,10 +229,14 @@ def connect(args: argparse.Namespace, name: str = "shmmap") -> Client:
     name
         Name of the session in ``shmmap clients``.
     """
+    return _connected(args, endpoint(args), name)
+
+
+def _connected(args: argparse.Namespace, path: str | None, name: str) -> Client:
     import shmmap
 
     timeout_s = ANSWER_S if args.timeout is None else args.timeout
     return shmmap.connect(
-        endpoint(args), timeout=timeout_s, connect_timeout=timeout_s, name=name,
+        path, timeout=timeout_s, connect_timeout=timeout_s, name=name,
         shm_dir=_setting(args, "shm_dir") or None,
     )  # fmt: skip

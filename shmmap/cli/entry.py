@@ -5,16 +5,15 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import signal
 import sys
 from collections.abc import Sequence
-from typing import Final
+from typing import Any, Final
 
 from shmmap.cli.program import Parser, exit_code_of, join_negative_values
 from shmmap.cli.verbs.run.about import installed_version
 from shmmap.errors import BadRequest
 from shmmap.lazy_imports import needed_packages
-
-__all__ = ["NUMBER_OPTIONS", "VERBS", "build_parser", "main", "serve_main", "verb_first"]
 
 GROUPS: Final = {
     "run a daemon": {
@@ -25,6 +24,7 @@ GROUPS: Final = {
         "stop": "cells.control.add_stop",
         "version": "run.about.add_version",
         "cpp": "run.about.add_cpp",
+        "completion": "run.completion.add_completion",
     },
     "look at it": {
         "status": "look.status.add_status",
@@ -33,6 +33,7 @@ GROUPS: Final = {
         "ls": "look.cells.add_ls",
         "show": "look.cells.add_show",
         "map": "look.map_view.add_parser",
+        "view": "look.view.add_parser",
         "clients": "look.status.add_clients",
         "metrics": "look.monitors.add_metrics",
         "health": "look.monitors.add_health",
@@ -87,7 +88,11 @@ NUMBER_OPTIONS: Final = frozenset({"--circle", "--square", "--box", "--z", "--or
 
 
 class _GroupedHelp(argparse.RawDescriptionHelpFormatter):
-    """Puts a heading above the first verb of each group."""
+    """Puts a heading above the first verb of each group, and the help of each verb beside it."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._action_max_length = max(map(len, VERBS)) + 2 * self._indent_increment
 
     def _format_action(self, action: argparse.Action) -> str:
         text = super()._format_action(action)
@@ -145,6 +150,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             build_parser().print_help(sys.stderr)
             return BadRequest.exit_code
         args = build_parser(words).parse_args(words)
+        if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
         with needed_packages(f"shmmap {words[0]}"):
             code: int = args.run(args)
         return code
@@ -159,6 +166,8 @@ def serve_main() -> int:
 
 def _ended_by(words: Sequence[str]) -> int:
     """Run a verb as this process; see `shmmap.processes.request_threads.leave`."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # until the verb runs: an import would print a traceback
     try:
         code: object = main(words)
     except SystemExit as ended:

@@ -13,23 +13,6 @@ from shmmap.cli.screens.output import user_name
 from shmmap.protocol import rows
 from shmmap.segment.names import retired_name, segment_prefix
 
-__all__ = [
-    "Box",
-    "Client",
-    "Failure",
-    "Fields",
-    "Hex",
-    "Holder",
-    "LiveMap",
-    "Point",
-    "Segment",
-    "hexed",
-    "json_schema",
-    "more_of",
-    "output_kinds",
-    "with_more",
-]
-
 Hex: TypeAlias = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{16}$", description="64 bits")]
 Point: TypeAlias = tuple[float, float, float]
 Box: TypeAlias = Annotated[
@@ -130,7 +113,7 @@ class Client(msgspec.Struct):
 
 
 class Segment(msgspec.Struct):
-    """A layer of a cell in shared memory; a zombie is a retired segment that clients still map."""
+    """A layer of a cell in shared memory; state "zombie" is a retired segment that clients still map."""
 
     id: str
     version: Hex
@@ -148,12 +131,11 @@ class Segment(msgspec.Struct):
 
     @classmethod
     def of(cls, row: rows.CellRow, now_monotonic_ns: int, *, id_prefix: str, instance: str) -> Segment:
-        """Return the JSON form of a segment's statistics row, whose names may be shortened."""
+        """Return the JSON form of a row in a list, whose names lack their prefixes."""
         found = cls.whole(row, now_monotonic_ns)
-        if not row.id.startswith("…"):
-            found.id = id_prefix + row.id
+        found.id = row.id if row.id.startswith("/") else id_prefix + row.id
         name = segment_prefix(instance) + row.segment
-        found.segment = retired_name(name) if row.state == "zombie" else name
+        found.segment = retired_name(name) if row.retired else name
         return found
 
     @classmethod
@@ -184,7 +166,7 @@ class LiveMap(msgspec.Struct):
     resolution: Annotated[float, msgspec.Meta(description="edge of a voxel, metres")]
     frame_id: str
     chunks: Annotated[int, msgspec.Meta(description="in memory")]
-    active: Annotated[int, msgspec.Meta(description="known voxels in them")]
+    active: Annotated[int, msgspec.Meta(description="voxels known in them")]
     bytes: int
     loading: int
     dirty: Annotated[int, msgspec.Meta(description="changed and not saved")]
@@ -195,7 +177,7 @@ class LiveMap(msgspec.Struct):
     scans: Annotated[int, msgspec.Meta(description="applied since the start")]
     durable: Annotated[int, msgspec.Meta(description="those of them on disk")]
     budget_bytes: int
-    damaged: Annotated[list[str], msgspec.Meta(description="quarantined files, missing chunks")]
+    damaged: Annotated[list[str], msgspec.Meta(description="lost chunks, damaged databases")]
     mappers: Annotated[list[str], msgspec.Meta(description="uid/name")]
     problem: str
     change: Annotated[int, msgspec.Meta(description="number of the last change")]

@@ -12,20 +12,6 @@ from typing import TypeAlias
 
 from shmmap.errors import ConfigError
 
-__all__ = [
-    "Subparsers",
-    "add_daemon_options",
-    "add_json_option",
-    "add_layer_option",
-    "add_statistics_options",
-    "add_verb",
-    "at_least",
-    "layers_from",
-    "numbers",
-    "seconds",
-    "size_bytes",
-]
-
 # argparse has no public name for this type
 Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 

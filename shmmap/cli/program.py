@@ -6,6 +6,7 @@ from __future__ import annotations
 import _signal as signal  # type: ignore[import-not-found]  # `signal` takes 2 ms to import
 import argparse
 import errno
+import io
 import os
 import re
 import sys
@@ -123,6 +124,7 @@ def join_negative_values(words: Sequence[str], options: Container[str] | None = 
 def exit_code_of(name: str, run: Callable[[], int]) -> int:
     """Run a program and return its exit code; print its errors on stderr."""
     _open_what_is_closed()
+    _write_all_letters()
     keep_interrupts()
     watch(CompilingLines(name))
     _show_warnings(name)
@@ -235,6 +237,13 @@ def _open_what_is_closed() -> None:
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
+
+
+def _write_all_letters() -> None:
+    """Let stdout show ``?`` for letters that the locale's encoding lacks: no name may end a program."""
+    encoding = sys.stdout.encoding or ""
+    if encoding.lower() not in ("utf-8", "utf8") and isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")
 
 
 def _drop_output() -> None:

@@ -15,6 +15,8 @@ These names, their parameters and their behaviour are stable; the rest of `shmma
     Types of options: whole numbers, durations, output files (refused at once if not writable).
 `write_text`, `writing_errors`
     Write a file; raise `shmmap.errors.CannotWrite` if that fails.
+`counted`, `format_bytes`
+    Return ``"1,200 points"`` or ``"4.1 MiB"``, as all screens have it.
 `print_json`, `print_line`, `printable`
     Print a JSON document or a line, or return text, with control codes for terminals escaped.
 `complain`
@@ -42,7 +44,7 @@ from shmmap.cli.program import (
     write_text,
     writing_errors,
 )
-from shmmap.cli.screens.output import print_json, print_line, printable
+from shmmap.cli.screens.output import counted, format_bytes, print_json, print_line, printable
 
 __all__ = [
     "Parser",
@@ -53,7 +55,9 @@ __all__ = [
     "at_least",
     "complain",
     "connect",
+    "counted",
     "exit_code_of",
+    "format_bytes",
     "join_negative_values",
     "nothing_found",
     "output_file",

@@ -22,18 +22,6 @@ from shmmap.protocol.messages import Intent
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = [
-    "MAX_ROUTE_PLACES",
-    "checked_seconds",
-    "given_intent",
-    "names",
-    "number",
-    "pose_intent",
-    "request_waits",
-    "thinned",
-    "timeout_s",
-]
-
 MAX_ROUTE_PLACES: Final = 512
 """Most places of a route that the daemon keeps; a longer route is resampled to this many, equally spaced."""
 MAX_WAIT_S: Final = 60.0

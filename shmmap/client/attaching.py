@@ -22,8 +22,6 @@ from shmmap.errors import SegmentError, warn_program
 from shmmap.protocol.messages import Handle
 from shmmap.segment.attach import Owned, attach
 
-__all__ = ["Attacher", "check_visible", "owner_of_segments"]
-
 
 class _Attached(weakref.ref[Cell]):
     """Weak reference to an attached cell, and the key under which it is found."""
@@ -126,6 +124,11 @@ class Attacher:
     def any_mapped(self) -> bool:
         """Whether this client still maps any memory, as of the last call of `unmapped`."""
         return bool(self._mapped)
+
+    @property
+    def has_unmapped(self) -> bool:
+        """Whether `unmapped` may return any version."""
+        return bool(self._ended or self._unmapped)
 
     def unmapped(self) -> list[int]:
         """Versions that this client no longer maps; the caller clears the list when the daemon has them."""

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from shmmap.errors import NoColumn
+from shmmap.errors import NoColumn, ShmmapError
 from shmmap.lazy_imports import needed_packages
 from shmmap.open3d_loading import load_open3d
 from shmmap.protocol.messages import Handle
@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     import open3d
     import torch
     from numpy.typing import NDArray
-
-__all__ = ["Access", "Cell"]
 
 
 class Access(NamedTuple):
@@ -42,8 +40,8 @@ class Cell:
     ended.  Its bytes never change; a change of the map produces a new cell.
 
     A pickled cell contains only its handle, and is attached when it is unpickled.  If the segment is gone by
-    then, that raises `StaleHandle` (``MULTIPROCESSING.md``).  `copy` makes a cell that does not depend on the
-    daemon.
+    then, that raises `StaleHandle` (``MULTIPROCESSING.md``).  The daemon counts it as used by the client that
+    the cell came from.  `copy` makes a cell that does not depend on the daemon.
 
     Attributes
     ----------
@@ -60,7 +58,8 @@ class Cell:
     box : tuple of float
         (min_x, min_y, max_x, max_y), metres, map frame.
     points : int
-        Rows of each column.
+        Number of rows: points, voxels, or occupied columns of a grid over the ground.  Tables over a
+        `lattice`, such as those of ``elevation``, (ny, nx), have more elements, also for what is empty.
     stale : bool
         Whether the source had changed, but its new version was not loaded yet, at the last reply that named
         this version.
@@ -105,7 +104,7 @@ class Cell:
         self._views: dict[str, NDArray[Any]] = {}
 
     def __len__(self) -> int:
-        """Return the number of points, or of rows in a computed layer."""
+        """Return the number of rows, `points`."""
         return self.points
 
     def __bool__(self) -> bool:
@@ -113,7 +112,16 @@ class Cell:
         return True
 
     def __repr__(self) -> str:
-        return f"<Cell {self.id} {self.layer} version {self.version_hex}, {self.points} points>"
+        rows = "points" if "xyz" in self.column_names else "rows"
+        return f"<Cell {self.id} {self.layer} version {self.version_hex}, {self.points} {rows}>"
+
+    def _repr_html_(self) -> str | None:
+        """Return a table and a picture for a notebook; None where they cannot be made."""
+        try:
+            from shmmap.client import notebook  # few programs are notebooks
+        except ShmmapError:  # the package was replaced
+            return None
+        return notebook.cell_html(self)
 
     # --- copies, and other processes --------------------------------------------------------------
 
@@ -159,7 +167,7 @@ class Cell:
     # --- columns --------------------------------------------------------------------------------
 
     def __getitem__(self, column: str) -> NDArray[Any]:
-        """Return a column by name: (N,) or (N, k), in the source's own dtype.
+        """Return a column by name: (N,) or (N, k), of a source in its own dtype; ``LAYERS.md`` lists all.
 
         Raises
         ------
@@ -181,7 +189,10 @@ class Cell:
 
     @property
     def xyz(self) -> NDArray[Any]:
-        """Coordinates, (N, 3) in the source's dtype (float32 as a rule), metres, relative to `origin`."""
+        """Coordinates, (N, 3) in the source's dtype (float32 as a rule), metres, relative to `origin`.
+
+        Grids (``elevation``, ``ground``) and ``ndt`` have none.
+        """
         return self["xyz"]
 
     @property

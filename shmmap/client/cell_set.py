@@ -9,13 +9,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, overload
 import numpy as np
 
 from shmmap.client.cell import Cell
-from shmmap.errors import BadRequest, CellError
+from shmmap.errors import BadRequest, CellError, ShmmapError
 from shmmap.protocol.messages import FailedCell, HeldCell
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-__all__ = ["CellSet", "Held", "HeldCells", "PendingLayer", "cell_error", "gather"]
 
 Held: TypeAlias = Cell | str | tuple[str, int | None] | tuple[str, int | None, tuple[str, ...]]
 """A held cell: an attached `Cell`, an id (its current version), (id, version), or (id, version, layers)."""
@@ -100,6 +98,14 @@ class CellSet(Sequence[Cell]):
             f"{'' if self.covered else ', not covered'}{self.reason and f' ({self.reason})'}>"
         )
 
+    def _repr_html_(self) -> str | None:
+        """Return a table and a picture for a notebook; None where they cannot be made."""
+        try:
+            from shmmap.client import notebook  # few programs are notebooks
+        except ShmmapError:  # the package was replaced
+            return None
+        return notebook.cell_set_html(self)
+
     @property
     def complete(self) -> bool:
         """Whether no requested cell is missing."""
@@ -132,8 +138,8 @@ class CellSet(Sequence[Cell]):
         NoColumn
             A cell has no such column.
         BadRequest
-            Coordinates of cells with different origins cannot be put into one array, or the set has several
-            layers of a cell.
+            Coordinates of cells with different origins cannot be put into one array, the set has several
+            layers of a cell, or the column is a table over a lattice.
         """
         if len({cell.layer for cell in self.cells}) > 1:
             raise BadRequest(
@@ -169,7 +175,8 @@ def gather(
     NoColumn
         A cell has no such column.
     BadRequest
-        Coordinates of cells with different origins cannot be put into one array.
+        Coordinates of cells with different origins cannot be put into one array, or the column is a table
+        over a lattice.
     """
     if "xyz" in columns and len({cell.origin for cell in cells}) > 1:
         raise BadRequest(
@@ -179,7 +186,13 @@ def gather(
     parts: dict[str, list[NDArray[Any]]] = {name: [] for name in columns}
     for cell, mask in zip(cells, masks, strict=True):
         for name, found in parts.items():
-            found.append(cell[name] if mask is None else cell[name][mask])
+            column = cell[name]
+            if len(column) != cell.points:
+                raise BadRequest(
+                    f"{name} of layer {cell.layer} is a table over a lattice, and has no row for each point",
+                    hint="take it of each cell, with cell.lattice",
+                )
+            found.append(column if mask is None else column[mask])
     return {
         name: np.concatenate(found) if found else np.empty((0, 3) if name == "xyz" else (0,), np.float32)
         for name, found in parts.items()

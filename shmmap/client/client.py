@@ -6,8 +6,9 @@ from __future__ import annotations
 import importlib
 import os
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial, wraps
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, NoReturn
+from typing import TYPE_CHECKING, Any, Concatenate, Final, NamedTuple, NoReturn, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -16,7 +17,8 @@ from shmmap.client.arguments import given_intent, names, request_waits, timeout_
 from shmmap.client.cell_set import CellSet, Held, HeldCells
 from shmmap.client.connection import until_served
 from shmmap.client.discovery import candidates
-from shmmap.client.session import Session
+from shmmap.client.session import Session, Steps
+from shmmap.errors import ShmmapError, warn_program
 from shmmap.installed import remember_modules
 from shmmap.lazy_imports import know_names
 from shmmap.protocol import messages
@@ -24,6 +26,8 @@ from shmmap.protocol.messages import Welcome
 from shmmap.segment.process_limits import no_files_left
 
 if TYPE_CHECKING:
+    from concurrent.futures import Future
+
     from numpy.typing import NDArray
 
     from shmmap.client.live.live_map import LiveMap
@@ -31,7 +35,8 @@ if TYPE_CHECKING:
     from shmmap.client.points_around import PointsAround
     from shmmap.protocol.live import LiveMapRow
 
-__all__ = ["DEFAULT_WAIT_S", "Client", "MapOrigin", "connect"]
+P = ParamSpec("P")
+R = TypeVar("R")
 
 DEFAULT_WAIT_S: Final = 5.0
 CONNECT_S: Final = 60.0
@@ -65,58 +70,18 @@ class MapOrigin(NamedTuple):
     unit_m: tuple[float, float]
 
 
-class Client:
-    """A session with the daemon; get one from `connect`.
+class SessionState:
+    """What a client knows of its session and the map without asking."""
 
-    Several threads may use a client: requests are sent one at a time, and other threads wait.
+    _session: Session
 
-    After a fork the child gets a session of its own with its first request.  Cells attached before
-    stay readable in it; until the child drops them or ends, the daemon counts them as in use by the
-    parent.  The parent notices nothing.
-
-    Every request has a deadline: ``timeout`` plus the time that the request lets the daemon wait.  It is
-    repeated on silence.  After a restart of the daemon the client begins a new session without any error.
-    """
-
-    def __init__(
-        self,
-        paths: Sequence[str],
-        *,
-        timeout: float,
-        connect_timeout: float,
-        name: str,
-        shm_dir: str,
-    ) -> None:
-        self._session = Session(
-            paths, timeout_s=timeout, connect_timeout_s=connect_timeout, name=name, shm_dir=shm_dir
-        )
-
-    def __enter__(self) -> Client:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
-
-    def __repr__(self) -> str:
-        return f"<Client of {self.endpoint}, map {self.welcome.map_path}>"
-
-    def __reduce__(self) -> NoReturn:
-        raise TypeError(
-            "a Client cannot be pickled: it is this process's connection to the daemon. Connect in each"
-            " process, shmmap.connect(...); a child that is forked may use it as it is. Cells can be pickled:"
-            " they go as handles"
-        )
-
-    def close(self) -> None:
-        """End the session; attached cells stay readable."""
-        self._session.close()
-
-    # --- session and map ---------------------------------------------------------------------
+    def _repr_html_(self) -> str | None:
+        """Return a table for a notebook, of what is known without a request; None where it cannot be made."""
+        try:
+            from shmmap.client import notebook  # few programs are notebooks
+        except ShmmapError:  # the package was replaced
+            return None
+        return notebook.client_html(self)
 
     @property
     def timeout(self) -> float:
@@ -174,6 +139,58 @@ class Client:
     def session(self) -> Session:
         """State that all requests of this client share; for use by windows."""
         return self._session
+
+
+class Client(SessionState):
+    """A session with the daemon; get one from `connect`.
+
+    Several threads may use a client: no request waits for another one's answer.
+
+    After a fork the child gets a session of its own with its first request.  Cells attached before
+    stay readable in it; until the child drops them or ends, the daemon counts them as in use by the
+    parent.  The parent notices nothing.
+
+    Every request has a deadline: ``timeout`` plus the time that the request lets the daemon wait.  It is
+    repeated on silence.  After a restart of the daemon the client begins a new session without any error.
+    """
+
+    def __init__(
+        self,
+        paths: Sequence[str],
+        *,
+        timeout: float,
+        connect_timeout: float,
+        name: str,
+        shm_dir: str,
+    ) -> None:
+        self._session = Session(
+            paths, timeout_s=timeout, connect_timeout_s=connect_timeout, name=name, shm_dir=shm_dir
+        )
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"<Client of {self.endpoint}, map {self.welcome.map_path}>"
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            "a Client cannot be pickled: it is this process's connection to the daemon. Connect in each"
+            " process, shmmap.connect(...); a child that is forked may use it as it is. Cells can be pickled:"
+            " they go as handles"
+        )
+
+    def close(self) -> None:
+        """End the session; attached cells stay readable."""
+        self._session.close()
 
     # --- cells ------------------------------------------------------------------------------------
 
@@ -238,13 +255,15 @@ class Client:
         """
         specs, message = names("layers", layers), messages.area_to_message(area)
         sent = given_intent(pose, velocity, heading, route)
-        return self._answer(
-            lambda wait_s: self._session.ask_cells(
-                lambda n: messages.Area(n, message, specs, wait_s, sent), wait_s
-            ),
-            area,
-            wait,
-            strict,
+        return self._run(
+            self._answer(
+                lambda wait_s: self._session.cells(
+                    lambda n: messages.Area(n, message, specs, wait_s, sent), wait_s
+                ),
+                area,
+                wait,
+                strict,
+            )
         )
 
     def points_around(
@@ -278,9 +297,22 @@ class Client:
         """
         from shmmap.client.points_around import points_around  # only windows and few programs need it
 
-        found = self.area(geometry.Circle(x, y, radius, z), layer, wait=wait, strict=strict)
-        boxes = np.array([cell.box for cell in found]).reshape(-1, 4)
-        return points_around(found.cells, boxes, x, y, radius, covered=found.complete)
+        circle = geometry.Circle(x, y, radius, z)
+        specs, message = names("layers", layer), messages.area_to_message(circle)
+
+        def steps() -> Steps[PointsAround]:
+            found = yield from self._answer(
+                lambda wait_s: self._session.cells(
+                    lambda n: messages.Area(n, message, specs, wait_s), wait_s
+                ),
+                circle,
+                wait,
+                strict,
+            )
+            boxes = np.array([cell.box for cell in found]).reshape(-1, 4)
+            return points_around(found.cells, boxes, x, y, radius, covered=found.complete)
+
+        return self._run(steps())
 
     def differential(
         self,
@@ -320,14 +352,16 @@ class Client:
         """
         specs, mine = names("layers", layers), HeldCells(held, by_name=by_name)
         sent = given_intent(pose, velocity, heading, route)
-        return self._answer(
-            lambda wait_s: self._session.ask_differential(
-                area, mine, specs, wait_s, sent, populate=populate, timeout_s=timeout
-            ),
-            area,
-            wait,
-            strict,
-            new=not mine.named and not mine.packed,
+        return self._run(
+            self._answer(
+                lambda wait_s: self._session.differential(
+                    area, mine, specs, wait_s, sent, populate=populate, timeout_s=timeout
+                ),
+                area,
+                wait,
+                strict,
+                new=not mine.named and not mine.packed,
+            )
         )
 
     def selected(
@@ -349,39 +383,54 @@ class Client:
         """
         specs = names("layers", layers)
         wanted, sent = names("ids", ids), given_intent(pose, velocity, heading, route)
-        return self._answer(
-            lambda wait_s: self._session.ask_cells(
-                lambda n: messages.Selected(n, wanted, specs, wait_s, sent), wait_s
-            ),
-            None,
-            wait,
-            strict,
+        return self._run(
+            self._answer(
+                lambda wait_s: self._session.cells(
+                    lambda n: messages.Selected(n, wanted, specs, wait_s, sent), wait_s
+                ),
+                None,
+                wait,
+                strict,
+            )
         )
+
+    @property
+    def futures(self) -> Futures:
+        """The requests for cells as `concurrent.futures.Future` objects: ``client.futures.around(x, y)``."""
+        return Futures(self)
+
+    def _run(self, steps: Steps[R]) -> R:
+        return self._session.run(steps)
 
     def _answer(
         self,
-        ask: Callable[[float | None], CellSet],
+        ask: Callable[[float | None], Steps[CellSet]],
         area: geometry.Area | None,
         wait: float | None,
         strict: bool | None,
         *,
         new: bool = True,
-    ) -> CellSet:
+    ) -> Steps[CellSet]:
         """Repeat a request while cells are pending and ``wait`` is not over; return the last answer.
 
         Unless ``strict`` is None, warn or raise if it is incomplete.  If not all is ``new``, it may be empty.
         """
         found = CellSet()
         for wait_s in request_waits(wait):
-            found = ask(wait_s)
+            found = yield from ask(wait_s)
             if not found.pending:
                 break
         has_points = any(cell.points for cell in found.cells)
         if strict is not None and (not found.complete or (new and not has_points)):
-            from shmmap.lacking import judge
+            from shmmap.lacking import verdict
 
-            judge(self, found, area, waited=bool(wait), strict=strict, new=new)
+            self._judge(partial(verdict, self, found, area, waited=bool(wait), strict=strict, new=new))
         return found
+
+    def _judge(self, verdict: Callable[[], str]) -> None:
+        """Warn of an answer that is incomplete; to find the words more may be asked."""
+        if text := verdict():
+            warn_program(text)
 
     def release(self) -> int:
         """Report the versions that this process dropped since the last request; return how many.
@@ -443,6 +492,16 @@ class Client:
     def stats(self) -> messages.StatsReply:
         """Return the daemon's counters, its sessions, and memory that processes without a session use."""
         return self._session.ask(messages.Stats, messages.StatsReply)
+
+    def list_cells(self) -> list[messages.CellRow]:
+        """List what is in memory, one row for each layer of a cell, by id, layer and version.
+
+        Ids and names of segments lack the prefixes that `welcome` has, and ``holders`` is empty.  A hundred
+        thousand segments take a second.
+        """
+        from shmmap.client.map_listing import list_segments  # most clients never list cells
+
+        return list_segments(self._session)
 
     def show(self, cell: str) -> messages.ShownCell:
         """Return everything about one cell: versions, segments and which processes use them, last failure.
@@ -514,6 +573,53 @@ class Client:
             The daemon lets only administrators do this.
         """
         self._session.ask(messages.Shutdown, messages.Stopping)
+
+
+class Deferred(Client):
+    """A client whose requests are not sent, but returned as steps."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+
+    def _run(self, steps: Steps[R]) -> R:
+        return steps  # type: ignore[return-value]
+
+
+def _later(method: Callable[Concatenate[Client, P], R]) -> Callable[Concatenate[Futures, P], Future[R]]:
+    """Return the method of `Futures` for a method of `Client`."""
+
+    @wraps(method)
+    def later(self: Futures, /, *args: P.args, **options: P.kwargs) -> Future[R]:
+        from shmmap.client.futures import begin  # it takes milliseconds; most clients wait for each answer
+
+        steps: Any = method(self._client, *args, **options)
+        return begin(self._client.session, steps)
+
+    return later
+
+
+class Futures:
+    """Requests for cells of a client that return a `concurrent.futures.Future`; get it as `Client.futures`.
+
+    The methods have the parameters of `Client`'s, and invalid ones raise at once.  Other errors, and warnings
+    as errors, are raised by ``result()``.  Any number may be under way: a request begins without waiting for
+    another one, and warm ones are answered while others wait for loads.  Of those that wait for loads the
+    daemon keeps 64 of a session; others are asked again when one of them ends.
+
+    ``cancel()`` succeeds until the answer is there, and ends the request's wait in the daemon.  Callbacks run
+    in one thread for all clients of the process, in which cells are attached, too: let them be short.  After
+    a fork the futures of the parent that were under way raise `BadRequest` in the child.  `Client.close` ends
+    those that are under way with `BadRequest`.
+    """
+
+    def __init__(self, client: Client) -> None:
+        self._client = Deferred(client.session)
+
+    around = _later(Client.around)
+    area = _later(Client.area)
+    points_around = _later(Client.points_around)
+    differential = _later(Client.differential)
+    selected = _later(Client.selected)
 
 
 def _load_all() -> None:

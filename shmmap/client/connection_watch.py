@@ -1,10 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """A connection's socket, and the thread that creates, watches and closes it.
 
+The thread also receives what is not received by the caller itself (`shmmap.client.connection`).
+
 libzmq's objects live in this thread because signal handlers run in the main thread alone: no handler's
 exception can leave an unreferenced object behind.  For the same reason a single built-in function starts the
 thread, and others wait for it through queues.  The thread blocks signals: the kernel may deliver a signal to
 any thread, and a context whose termination is interrupted stays, with a thread and five descriptors.
+
+Locks are taken by ``with lock`` alone.  Python runs signal handlers between interpreter steps; since
+``__enter__`` and ``__exit__`` of a lock are built-in functions, a ``with`` calls them and enters or leaves
+its block in the same step.  So no handler's exception arrives while the lock is taken outside the block.
 
 When the interpreter ends, nothing is closed: another thread may be using the socket, and libzmq aborts the
 process if a socket is closed while in use.  Python stops such threads, and the kernel closes the descriptors.
@@ -17,8 +23,11 @@ from __future__ import annotations
 
 import _thread
 import contextlib
+import math
 import os
+import select
 import struct
+import threading
 import time
 import weakref
 from collections.abc import Callable, Sequence
@@ -35,17 +44,6 @@ if TYPE_CHECKING:
 else:
     import _signal  # `signal` is the same with enumerations, which take a millisecond to import
 
-__all__ = [
-    "CONNECTION",
-    "FILES",
-    "ConnectionWatch",
-    "Running",
-    "enter",
-    "running",
-    "start_thread",
-    "stop_orphans",
-]
-
 _EVENT: Final = struct.Struct("=HI")  # first frame of a message of zmq_socket_monitor(3): event, value
 _EVENTS: Final = (
     zmq.EVENT_HANDSHAKE_SUCCEEDED
@@ -58,10 +56,11 @@ _OURS: Final = frozenset({_signal.SIGBUS, _signal.SIGFPE, _signal.SIGILL, _signa
 """Signals that a thread's own faults cause; they must not be blocked."""
 _OPTIONS: Final = ((zmq.LINGER, 0), (zmq.RECONNECT_IVL, 20), (zmq.RECONNECT_IVL_MAX, 500))
 """Options of every socket, milliseconds."""
+_WAKE_S: Final = 0.1  # longest wait for another thread that wakes one
 _LAST_WORDS_MS: Final = 100  # time for a last message to be delivered on closing
 CONNECTION: Final = "a connection to the daemon"
-FILES: Final = 10
-"""Descriptors that libzmq needs (context, socket, monitor, connection), plus one for mapping segments."""
+FILES: Final = 11
+"""Descriptors of libzmq (context, socket, monitor, connection), one to wake the thread, one for mapping."""
 THREADS: Final = 2
 """Threads that libzmq starts for a context, besides the thread that creates it."""
 _OVER_S: Final = 0.5  # interval at which a wait for the end checks again, should another thread wait, too
@@ -114,6 +113,23 @@ def start_thread(run: Callable[..., object], *arguments: object) -> None:
         raise no_threads_left("no thread can be started: ") from None
 
 
+class _BriefTurn:
+    """A ``with`` that waits at most ``timeout_s`` for its lock; after that, entering raises `StopIteration`.
+
+    Both functions of the protocol are built-in ones here, as they are of the lock itself.
+    """
+
+    __slots__ = ("__enter__", "__exit__")
+
+    __enter__: Any
+    __exit__: Any
+
+    def __init__(self, lock: threading.Lock, timeout_s: float) -> None:
+        # False, after a timeout, is filtered out, and there is no next element
+        self.__enter__ = filter(None, map(lock.acquire, (True,), (timeout_s,))).__next__
+        self.__exit__ = lock.__exit__
+
+
 class ConnectionWatch:
     """One socket, created and closed by a thread, and the state of its connection as libzmq reports it.
 
@@ -132,12 +148,18 @@ class ConnectionWatch:
 
     Attributes
     ----------
+    lock : threading.Lock
+        Held by the thread that uses the socket.
+    serve : callable or None
+        What the thread calls when the socket may be readable or writable, after `wake`, and after the seconds
+        that the last call returned.  After None the thread does not look at the socket until `wake`.
     handshakes : int
         Number of times the connection was established.
     lost_since : float or None
         `time.monotonic` when the connection broke; None while it stands, and before it was first established.
-    hung_up : bool
-        The peer closed the connection before any handshake, and libzmq has not retried yet.
+    hung_up_since : float or None
+        `time.monotonic` when the peer closed the connection before any handshake, if libzmq has not retried
+        since.
     foreign : bool
         The peer does not speak the expected protocol.
 
@@ -156,19 +178,24 @@ class ConnectionWatch:
         kind: int = zmq.DEALER,
     ) -> None:
         self.owner = weakref.ref(owner)
+        self.lock = threading.Lock()
+        self.serve: Callable[[], float | None] | Callable[[], None] | None = None
         self.handshakes = 0
         self.lost_since: float | None = None
-        self.hung_up = False
+        self.hung_up_since: float | None = None
         self.foreign = False
         self._waiting = waiting
         self._pid = os.getpid()
         self._made: SimpleQueue[BaseException | None] = SimpleQueue()
-        self._connected: SimpleQueue[None] = SimpleQueue()
         self._over: SimpleQueue[None] = SimpleQueue()
-        self._stopping = False
+        self._taking = threading.Lock()
+        self._stopping = self._stopped = False
         self._ended = False
         self._thread = 0
+        self._waking = threading.Lock()
+        self._wake_fd = -1
         self._socket: zmq.Socket[bytes] | None = None
+        self._monitor: zmq.Socket[bytes] | None = None
         check_files(FILES, CONNECTION)
         start_thread(self._run, endpoint, options, kind)
         failure = self._made.get()
@@ -181,11 +208,12 @@ class ConnectionWatch:
         assert self._socket is not None  # noqa: S101  set before the constructor returns
         return self._socket
 
-    def wait_until_connected(self, timeout_s: float) -> None:
-        """Wait for the first handshake."""
-        if not self.handshakes:
-            with contextlib.suppress(Empty):
-                self._connected.get(timeout=max(timeout_s, 0.0))
+    def wake(self) -> None:
+        """Have the thread call `serve`."""
+        # no lock after a while: of a signal handler that has interrupted just this
+        with contextlib.suppress(StopIteration), _BriefTurn(self._waking, _WAKE_S):
+            if self._wake_fd >= 0:
+                os.eventfd_write(self._wake_fd, 1)
 
     def stop(self) -> None:
         """Make the thread close the socket and end; wait for that, unless called in that thread."""
@@ -226,13 +254,15 @@ class ConnectionWatch:
                 ends.callback(socket.close, linger=_LAST_WORDS_MS)
                 for option, value in (*_OPTIONS, *options):
                     socket.setsockopt(option, value)
-                monitor = socket.get_monitor_socket(_EVENTS)
-                ends.callback(monitor.close, linger=0)
+                self._monitor = socket.get_monitor_socket(_EVENTS)
+                ends.callback(self._monitor.close, linger=0)
+                self._wake_fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+                ends.callback(self._close_wake)
                 socket.connect(endpoint)
                 self._socket = socket
                 self._made.put(None)
                 if not self._stopping:
-                    self._listen(monitor)
+                    self._listen(socket, self._monitor)
         except zmq.ZMQError as error:  # other threads took the last descriptors since they were counted
             self._made.put(LimitReached(f"no connection to the daemon: {error.strerror or error}"))
         except BaseException as error:  # noqa: BLE001  raised again by the thread that waits for the socket
@@ -241,23 +271,61 @@ class ConnectionWatch:
             self._ended = True
             self._over.put(None)
 
-    def _listen(self, monitor: zmq.Socket[bytes]) -> None:
-        while True:
-            # zmq.utils.monitor would do this, but loads asyncio (20 ms)
-            event, _value = _EVENT.unpack(monitor.recv_multipart()[0])
+    def _close_wake(self) -> None:
+        with self._waking:
+            wake_fd, self._wake_fd = self._wake_fd, -1
+            os.close(wake_fd)
+
+    def _listen(self, socket: zmq.Socket[bytes], monitor: zmq.Socket[bytes]) -> None:
+        """Take events and serve the socket until the monitor is stopped."""
+        poller = select.poll()
+        # libzmq signals its descriptors once: afterwards all has to be taken
+        monitor_fd, socket_fd = int(monitor.getsockopt(zmq.FD)), int(socket.getsockopt(zmq.FD))
+        poller.register(monitor_fd, select.POLLIN)
+        poller.register(self._wake_fd, select.POLLIN)
+        is_served, ready = False, [monitor_fd]
+        while monitor_fd not in ready or self.take_events():
+            if self._wake_fd in ready:
+                os.eventfd_read(self._wake_fd)
+            left_s = self.serve() if self.serve is not None else None
+            if self._stopped:
+                break
+            if is_served != (left_s is not None):
+                is_served = not is_served
+                if is_served:
+                    poller.register(socket_fd, select.POLLIN)
+                else:
+                    poller.unregister(socket_fd)
+            ready = [fd for fd, _ in poller.poll(None if left_s is None else math.ceil(left_s * 1000))]
+        self.serve = None
+
+    def take_events(self) -> bool:
+        """Take what libzmq has reported; return False when the thread has to end."""
+        monitor = self._monitor
+        assert monitor is not None  # noqa: S101  it is there before the thread listens
+        with self._taking:
+            return self._take_from(monitor)
+
+    def _take_from(self, monitor: zmq.Socket[bytes]) -> bool:
+        while not self._stopped:
+            try:
+                # zmq.utils.monitor would do this, but loads asyncio (20 ms)
+                event, _value = _EVENT.unpack(monitor.recv_multipart(zmq.DONTWAIT)[0])
+            except zmq.Again:
+                return True
             if event == zmq.EVENT_MONITOR_STOPPED:
-                return
-            if event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
+                self._stopped = True
+            elif event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
                 self.handshakes += 1
-                self.lost_since = None
-                self._connected.put(None)
+                self.lost_since = self.hung_up_since = None
             elif event == zmq.EVENT_CONNECT_RETRIED:
-                self.hung_up = False
+                self.hung_up_since = None
             elif event == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL:
                 self.foreign = True
-            else:
-                self.hung_up = not self.handshakes
-                if self.handshakes and self.lost_since is None:
-                    self.lost_since = time.monotonic()
-                    for queue in tuple(self._waiting):
-                        queue.put(None)
+            elif not self.handshakes:
+                self.hung_up_since = time.monotonic()
+            elif self.lost_since is None:
+                self.lost_since = time.monotonic()
+                for queue in tuple(self._waiting):
+                    queue.put(None)
+        return False

@@ -29,8 +29,6 @@ from shmmap.protocol.endpoint import (
 )
 from shmmap.segment.names import check_instance
 
-__all__ = ["candidates", "check_socket", "find_socket", "is_served"]
-
 _SIGNATURE_BYTES: Final = 10
 _FULL_S: Final = 0.005
 _START_HINT: Final = (

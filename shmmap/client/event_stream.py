@@ -31,8 +31,6 @@ from shmmap.errors import NoAnswer, ProtocolMismatch
 from shmmap.protocol.endpoint import endpoint_path
 from shmmap.protocol.events import UNNUMBERED, Beat, Event, EventPage, Recent, decode_event
 
-__all__ = ["EventStream", "MissedEvents"]
-
 _TIMEOUT_S: Final = 5.0
 _SLICE_MS: Final = 100  # interval at which a wait checks whether another thread has closed the stream
 _QUEUE: Final = 4096  # events kept while the program does something else; the daemon remembers as many
@@ -164,6 +162,14 @@ class EventStream:
                 elif left_ms <= _SLICE_MS:
                     return None
         return self._ready.popleft()
+
+    def descriptor(self) -> int:
+        """Return a descriptor of the caller's own, which is readable when something has come since `next`.
+
+        It is signalled once: then take all, with ``next(0)`` until that returns None.
+        """
+        with self._using:
+            return os.dup(int(self._socket.getsockopt(zmq.FD)))
 
     @property
     def path(self) -> str:

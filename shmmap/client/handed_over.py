@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-__all__ = ["hand_over"]
-
 _COPY_HINT: Final = (
     "keep the cell until the other process has it, or hand over cell.copy(), which has the points"
 )

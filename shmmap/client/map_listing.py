@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The map's list of cells, from the daemon."""
+"""Lists from the daemon that take several requests: the map's cells, and what is in memory."""
 
 from __future__ import annotations
 
@@ -12,17 +12,18 @@ import numpy as np
 
 import shmmap.geometry as geometry
 from shmmap.client.session import Session
-from shmmap.errors import NoAnswer
+from shmmap.errors import NoAnswer, ProtocolMismatch
 from shmmap.protocol import messages
 from shmmap.protocol.messages import MetadataRow
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["CellInfo", "MapListing", "list_cells"]
+    from shmmap.protocol.rows import CellRow
 
 _ROUNDS: Final = 5  # how often a listing is restarted because the map changed meanwhile
 _PAGE_ROWS: Final = 10_000
+_LIST_CELLS_MINOR: Final = 2  # minor version of the protocol since which there is `ListCells`
 
 
 class CellInfo(NamedTuple):
@@ -150,3 +151,35 @@ def list_cells(
             assert listing is not None  # noqa: S101  the loop ran at least once
             return listing
     raise NoAnswer("the map kept changing while it was being listed", hint="ask again later")
+
+
+def list_segments(session: Session) -> list[CellRow]:
+    """Request all pages of what is in memory; see `shmmap.Client.list_cells`.
+
+    Raises
+    ------
+    NoAnswer
+        No reply before the deadline, or the daemon was restarted each time before the last page.
+    ProtocolMismatch
+        The daemon is of a version that had this list in its statistics.
+    """
+    if (welcome := session.welcome).minor < _LIST_CELLS_MINOR:
+        raise ProtocolMismatch(
+            f"the daemon speaks protocol {welcome.major}.{welcome.minor}: it cannot list what is in memory",
+            hint="update the daemon, and restart it",
+        )
+    for _ in range(_ROUNDS):
+        found: dict[str, CellRow] = {}  # by name: while segments go, one may be on two pages
+        epoch, start = 0, 0
+        while True:
+            page = session.ask(
+                lambda n, at=start: messages.ListCells(n, at),  # type: ignore[misc]
+                messages.CellsPage,
+            )
+            if page.epoch != (epoch := epoch or page.epoch):
+                break
+            found.update((row.segment, row) for row in page.rows)
+            if page.next is None:
+                return sorted(found.values(), key=lambda row: (row.id, row.layer, row.version))
+            start = page.next
+    raise NoAnswer("the daemon kept restarting while it listed its cells", hint="ask again later")

@@ -16,8 +16,6 @@ from shmmap.geometry import Circle, distance_to_boxes
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["PointsAround", "points_around"]
-
 
 class PointsAround:
     """Cells that touch a circle, and the selection of their points that lie in it.

@@ -8,28 +8,27 @@ requested again.
 from __future__ import annotations
 
 import os
-import sys
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
+from functools import partial
 from queue import SimpleQueue
-from types import FrameType
-from typing import Any, Final, NoReturn, TypeVar
+from typing import Any, Final, NoReturn, TypeAlias, TypeVar
 
+import msgspec
 import numpy as np
 
 from shmmap.client.attaching import Attacher, check_visible, owner_of_segments
 from shmmap.client.cell import Access, Cell
 from shmmap.client.cell_set import CellSet, HeldCells, PendingLayer, cell_error
-from shmmap.client.connection import Connection, closed
-from shmmap.errors import BadRequest, CellError, LoadFailed, NoAnswer, SegmentCorrupt, StaleHandle
+from shmmap.client.connection import TURNS, Connection, check_not_within_a_turn, closed
+from shmmap.client.request_table import Answers
+from shmmap.errors import CellError, LoadFailed, SegmentCorrupt, StaleHandle
 from shmmap.failpoints import step
 from shmmap.geometry import Area
 from shmmap.protocol import messages
 from shmmap.protocol.messages import Handle
-
-__all__ = ["Session"]
 
 R = TypeVar("R")
 
@@ -37,8 +36,21 @@ _STALE_ROUNDS: Final = 5  # how often a handle that became stale before it was a
 _MAX_STALE_WAIT_S: Final = 5.0  # longest wait that such a request allows the daemon
 
 
+class Asked(msgspec.Struct):
+    """A request of several that come to one answer, and what its reply is."""
+
+    make: Callable[[int], messages.Request]
+    kind: type[Any]
+    timeout_s: float
+    quiet_s: float
+
+
+Steps: TypeAlias = Generator[Asked, Any, R]
+"""Requests that are sent one after another, each after the reply to the one before; returns an answer."""
+
+
 class Session:
-    """One client's session; requests are sent one at a time, other threads wait.
+    """One client's session; several threads may use it, and no request waits for another one.
 
     After a fork the child begins a session of its own with its first request; the parent's
     connection is not touched.
@@ -58,8 +70,6 @@ class Session:
 
     Attributes
     ----------
-    welcome : Welcome
-        The daemon's message when the session began.
     map_version : int
         State of the map in the last reply about cells.
     attacher : Attacher
@@ -75,7 +85,8 @@ class Session:
         self._connect_timeout_s = connect_timeout_s
         self._name = name
         self._shm_dir = shm_dir
-        self._lock = threading.Lock()
+        self._attaching = threading.Lock()
+        self._connecting = threading.Lock()
         self._closed = False
         self._access_epoch = 0
         self._access: Access | None = None
@@ -83,18 +94,34 @@ class Session:
         self._inherited: list[Connection] = []
         self._connection: Connection | None = None
         self.path = ""
-        connection = self._connect()
-        self.welcome = connection.welcome
-        self.map_version = self.welcome.map_version
+        self.map_version = self._connect().welcome.map_version
         _sessions.append(weakref.ref(self, _sessions.remove))
 
     def _connect(self) -> Connection:
         connection = Connection(
             self._paths, name=self._name, timeout_s=self._connect_timeout_s, waiting=self._waiting
         )
-        self._connection = connection
-        self.path = connection.path
+        self._connection, self.path, self._welcome = connection, connection.path, connection.welcome
         return connection
+
+    def _connected(self) -> Connection:
+        """Return the connection; a forked child makes one of its own."""
+        connection = self._connection
+        if connection is None:
+            if self._connecting.locked():
+                check_not_within_a_turn(self)
+            with self._connecting:
+                if self._closed:
+                    raise closed("client", "connect again")
+                connection = self._connection or self._connect()
+        return connection
+
+    @property
+    def welcome(self) -> messages.Welcome:
+        """The daemon's message when the session began."""
+        if self._connection is not None:
+            self._welcome = self._connection.welcome
+        return self._welcome
 
     @property
     def lost_since(self) -> float | None:
@@ -124,38 +151,14 @@ class Session:
         BadRequest
             A signal handler that interrupted a request calls this.
         """
-        if self._lock.locked():
-            _check_not_within_a_turn(self)
-        with self._lock:
-            connection = self._connection
-            if not self._closed and connection is not None:
-                self._report_unmapped(connection)
-                if not self.attacher.any_mapped:  # else the daemon should keep this process as a holder
-                    connection.send(messages.Bye(connection.new_request()))
-            self._closed = True
-            if connection is not None:
-                connection.close()
-
-    def _in_turn(self, timeout_s: float, work: Callable[[Connection], R]) -> R:
-        """Wait until no other thread uses the connection, then use it for one request."""
-        if self._lock.locked():
-            _check_not_within_a_turn(self)
-        entered = False
-        try:
-            with _Turn(self._lock, timeout_s):  # type: ignore[misc]
-                entered = True
-                if self._closed:
-                    raise closed("client", "connect again")
-                connection = self._connection or self._connect()
-                self._report_unmapped(connection)
-                return work(connection)
-        except StopIteration:
-            if entered:
-                raise
-        raise NoAnswer(
-            f"another thread's request was under way for {timeout_s:.3g} s",
-            hint="give each thread that waits long a client of its own",
-        )
+        connection = self._connection
+        if not self._closed and connection is not None:
+            self._report_unmapped(connection)
+        # a process that holds anything should be kept as a holder
+        bye = not self._closed and not self.attacher.any_mapped
+        self._closed = True
+        if connection is not None:
+            connection.close(bye=bye)
 
     def ask(
         self,
@@ -171,16 +174,42 @@ class Session:
         ``timeout_s`` is how long the reply may take beyond that, instead of the session's own timeout.
         """
         all_s = (self.timeout_s if timeout_s is None else timeout_s) + quiet_s
+        reply: R = self._reply(Asked(make, kind, all_s, quiet_s))
+        return reply
 
-        def work(connection: Connection) -> R:
-            message = make(connection.new_request())
-            reply = connection.ask(message, kind, timeout_s=all_s, quiet_s=quiet_s)
-            self.welcome = connection.welcome
-            return reply
+    def _reply(self, asked: Asked) -> Any:
+        connection = self._connected()
+        if self.attacher.has_unmapped and not self._attaching.locked():
+            self._report_unmapped(connection)
+        message = asked.make(connection.new_request())
+        return connection.ask(message, asked.kind, timeout_s=asked.timeout_s, quiet_s=asked.quiet_s)
 
-        return self._in_turn(all_s, work)
+    def run(self, steps: Steps[R]) -> R:
+        """Send the requests of ``steps`` and wait for each reply; return the answer."""
+        try:
+            asked = next(steps)
+            while True:
+                asked = steps.send(self._reply(asked))
+        except StopIteration as end:
+            answer: R = end.value
+            return answer
 
-    def ask_cells(
+    def begin(self, asked: Asked, answers: Answers, for_whom: object) -> Callable[[], None]:
+        """Send a request whose reply goes to ``answers``; return what withdraws it."""
+        connection = self._connected()
+        if self.attacher.has_unmapped and not self._attaching.locked():
+            self._report_unmapped(connection)
+        message = asked.make(connection.new_request())
+        connection.begin(
+            message, answers, timeout_s=asked.timeout_s, quiet_s=asked.quiet_s, for_whom=for_whom
+        )
+        return partial(connection.withdraw, message.request)
+
+    def drive_by(self, wake: Callable[[], None]) -> tuple[int, Callable[..., float | None]]:
+        """Have an event loop send and receive from now on; see `Connection.drive_by`."""
+        return self._connected().drive_by(wake)
+
+    def cells(
         self,
         make: Callable[[int], messages.Request],
         wait_s: float | None,
@@ -188,8 +217,8 @@ class Session:
         removed: Callable[[Sequence[str], bytes], tuple[str, ...]] | None = None,
         populate: bool = False,
         timeout_s: float | None = None,
-    ) -> CellSet:
-        """Send a request for cells and attach the cells of its reply.
+    ) -> Steps[CellSet]:
+        """Ask for cells and attach the cells of the reply.
 
         Parameters
         ----------
@@ -205,29 +234,29 @@ class Session:
         quiet_s = wait_s or 0.0
         all_s = (self.timeout_s if timeout_s is None else timeout_s) + quiet_s
         deadline_s = time.monotonic() + all_s
+        reply = yield Asked(make, messages.Cells, all_s, quiet_s)
+        self.map_version = reply.map_version
+        step("client.answer")
+        answer = _ReplyCells(self._connected().welcome, self._attach, populate=populate)
+        self._take(answer, reply, range(len(reply.cells)))
+        for _ in range(_STALE_ROUNDS):
+            if not answer.gone or time.monotonic() >= deadline_s:
+                break
+            again = answer.ask_again(deadline_s)
+            answer.welcome = self._connected().welcome
+            self._take(answer, *answer.placed((yield again)))
+            if answer.gone:  # not at first: a daemon that ends removes all its segments
+                welcome = answer.welcome
+                check_visible(self._shm_dir or welcome.shm_dir, welcome.segment_prefix)
+        return answer.result(reply, removed)
 
-        def work(connection: Connection) -> CellSet:
-            message = make(connection.new_request())
-            reply = connection.ask(message, messages.Cells, timeout_s=all_s, quiet_s=quiet_s)
-            self.map_version = reply.map_version
-            self.welcome = connection.welcome
-            step("client.answer")
-            answer = _ReplyCells(lambda handle: self._attach(handle, connection, populate), self.whole_id)
-            answer.take(reply, range(len(reply.cells)))
-            for _ in range(_STALE_ROUNDS):
-                if not answer.gone or time.monotonic() >= deadline_s:
-                    break
-                answer.ask_again(connection, deadline_s)
-                if answer.gone:  # not at first: a daemon that ends removes all its segments
-                    check_visible(
-                        self._shm_dir or connection.welcome.shm_dir, connection.welcome.segment_prefix
-                    )
-            self.welcome = connection.welcome
-            return answer.result(reply, removed)
+    def _take(self, answer: _ReplyCells, reply: messages.Cells, places: Iterable[int]) -> None:
+        if self._attaching.locked():
+            check_not_within_a_turn(self)
+        with self._attaching:
+            answer.take(reply, places)
 
-        return self._in_turn(all_s, work)
-
-    def ask_differential(
+    def differential(
         self,
         area: Area,
         held: HeldCells,
@@ -237,10 +266,10 @@ class Session:
         *,
         populate: bool = False,
         timeout_s: float | None = None,
-    ) -> CellSet:
-        """Request the cells of an area that are not held; see `shmmap.Client.differential`."""
+    ) -> Steps[CellSet]:
+        """Ask for the cells of an area that are not held; see `shmmap.Client.differential`."""
         message = messages.area_to_message(area)
-        return self.ask_cells(
+        return self.cells(
             lambda n: messages.Differential(n, message, layers, held.named, held.packed, wait_s, intent),
             wait_s,
             removed=held.removed,
@@ -250,32 +279,31 @@ class Session:
 
     def report_unmapped(self) -> int:
         """Report to the daemon the versions unmapped since the last request; return how many."""
+        connection = self._connected()
+        reported = self._report_unmapped(connection)
+        # the reply to this request means that the report before it has arrived
+        connection.ask(
+            messages.Release(connection.new_request(), b""), messages.Released, timeout_s=self.timeout_s
+        )
+        return reported
 
-        def work(connection: Connection) -> int:
-            reported = self._reported
-            # the reply to this request means that the report before it has arrived
-            connection.ask(
-                messages.Release(connection.new_request(), b""), messages.Released, timeout_s=self.timeout_s
-            )
-            return reported
-
-        return self._in_turn(self.timeout_s, work)
-
-    def _report_unmapped(self, connection: Connection) -> None:
-        versions = self.attacher.unmapped()
-        self._reported = len(versions)
-        if versions:
-            connection.send(
-                messages.Release(connection.new_request(), np.fromiter(versions, "<u8").tobytes())
-            )
-            versions.clear()
+    def _report_unmapped(self, connection: Connection) -> int:
+        if self._attaching.locked():
+            check_not_within_a_turn(self)
+        with self._attaching:
+            versions = self.attacher.unmapped()
+            reported = len(versions)
+            if versions:
+                packed = np.fromiter(versions, "<u8").tobytes()
+                connection.send(messages.Release(connection.new_request(), packed))
+                versions.clear()
+        return reported
 
     def whole_id(self, cell_id: str) -> str:
         """Return the full cell id of an id that a reply contains."""
-        return cell_id if cell_id.startswith("/") else self.welcome.id_prefix + cell_id
+        return _whole_id(cell_id, self.welcome)
 
-    def _attach(self, handle: Handle, connection: Connection, populate: bool) -> Cell:
-        welcome = connection.welcome
+    def _attach(self, handle: Handle, welcome: messages.Welcome, populate: bool) -> Cell:
         access = self._access
         if access is None or welcome.epoch != self._access_epoch:
             shm_dir = self._shm_dir or welcome.shm_dir
@@ -284,7 +312,7 @@ class Session:
             self._access_epoch = welcome.epoch
         return self.attacher.attach(
             handle,
-            handle.id if handle.id.startswith("/") else welcome.id_prefix + handle.id,
+            _whole_id(handle.id, welcome),
             welcome.segment_prefix + handle.segment,
             access,
             populate=populate,
@@ -295,7 +323,8 @@ class Session:
             # referenced, but unused, so that this process never closes the parent's sockets
             self._inherited.append(self._connection)
             self._connection = None
-        self._lock = threading.Lock()
+        self._attaching = threading.Lock()
+        self._connecting = threading.Lock()
         self._waiting = []
         self.attacher.restart_in_child()
 
@@ -305,10 +334,12 @@ class _ReplyCells:
 
     Parameters
     ----------
+    welcome
+        What ids and names of segments in the reply lack.
     attach
         Makes a cell from a handle; `StaleHandle` and `SegmentCorrupt` affect that cell only.
-    whole_id
-        Makes the full cell id from an id in a reply.
+    populate
+        Map every page now, not at first access.
 
     Attributes
     ----------
@@ -316,9 +347,16 @@ class _ReplyCells:
         Places and handles whose segments were gone before they could be attached.
     """
 
-    def __init__(self, attach: Callable[[Handle], Cell], whole_id: Callable[[str], str]) -> None:
+    def __init__(
+        self,
+        welcome: messages.Welcome,
+        attach: Callable[[Handle, messages.Welcome, bool], Cell],
+        *,
+        populate: bool,
+    ) -> None:
+        self.welcome = welcome
         self._attach = attach
-        self._whole = whole_id
+        self._populate = populate
         self._cells: dict[int, Cell] = {}
         self._failed: list[CellError] = []
         self._pending: list[PendingLayer] = []
@@ -328,7 +366,7 @@ class _ReplyCells:
         """Attach a reply's handles at these places; record which became stale meanwhile and which failed."""
         for place, handle in zip(places, reply.cells, strict=True):
             try:
-                self._cells[place] = self._attach(handle)
+                self._cells[place] = self._attach(handle, self.welcome, self._populate)
             except StaleHandle:  # noqa: PERF203  one cell must not affect the others
                 self.gone.append((place, handle))
             except SegmentCorrupt as error:
@@ -345,20 +383,25 @@ class _ReplyCells:
             for cell in reply.failed
         ]
 
-    def ask_again(self, connection: Connection, deadline_s: float) -> None:
-        """Request again the handles whose segments were gone before they could be attached."""
+    def _whole(self, cell_id: str) -> str:
+        return _whole_id(cell_id, self.welcome)
+
+    def ask_again(self, deadline_s: float) -> Asked:
+        """Return the request for the handles whose segments were gone before they could be attached."""
+        timeout_s = max(deadline_s - time.monotonic(), 1e-3)
+        ids = tuple(dict.fromkeys(handle.id for _, handle in self.gone))
+        layers = tuple(dict.fromkeys(handle.layer for _, handle in self.gone))
+        wait_s = min(timeout_s / 2, _MAX_STALE_WAIT_S)
+        return Asked(
+            lambda n: messages.Selected(n, ids, layers, wait_s), messages.Cells, timeout_s, timeout_s / 2
+        )
+
+    def placed(self, reply: messages.Cells) -> tuple[messages.Cells, list[int]]:
+        """Return what is new of the reply to `ask_again`, and the places of its cells."""
         gone, self.gone = self.gone, []
         places: dict[tuple[str, str], list[int]] = {}
         for place, handle in gone:
             places.setdefault((handle.id, handle.layer), []).append(place)
-        timeout_s = max(deadline_s - time.monotonic(), 1e-3)
-        message = messages.Selected(
-            connection.new_request(),
-            tuple(dict.fromkeys(cell_id for cell_id, _ in places)),
-            tuple(dict.fromkeys(layer for _, layer in places)),
-            min(timeout_s / 2, _MAX_STALE_WAIT_S),
-        )
-        reply = connection.ask(message, messages.Cells, timeout_s=timeout_s, quiet_s=timeout_s / 2)
         wanted = [handle for handle in reply.cells if (handle.id, handle.layer) in places]
         repeated = [(place, handle) for handle in wanted for place in places[handle.id, handle.layer]]
         again = messages.Cells(
@@ -369,7 +412,7 @@ class _ReplyCells:
             pending=tuple(cell for cell in reply.pending if (cell.id, cell.layer) in places),
             failed=tuple(cell for cell in reply.failed if (cell.id, cell.layer) in places),
         )
-        self.take(again, [place for place, _ in repeated])
+        return again, [place for place, _ in repeated]
 
     def result(
         self,
@@ -391,48 +434,11 @@ class _ReplyCells:
         )
 
 
-class _Turn:
-    """Exclusive use of the connection, released whatever exception a signal handler raises.
-
-    A context manager that waits at most ``timeout_s`` for its lock; after that, entering raises
-    `StopIteration`.
-
-    Python runs signal handlers between interpreter steps.  If ``__enter__`` and ``__exit__`` are built-in
-    functions, a ``with`` calls them and enters or leaves its block in the same step.  So no handler's
-    exception can arrive while the lock is taken outside the block.  Therefore both are not methods here but
-    built-in functions, which each object holds in its slots.
-    """
-
-    __slots__ = ("__enter__", "__exit__")
-
-    __enter__: Callable[[], object]
-    __exit__: Callable[..., None]
-
-    def __init__(self, lock: threading.Lock, timeout_s: float) -> None:
-        # False, after a timeout, is filtered out, and there is no next element
-        self.__enter__ = filter(None, map(lock.acquire, (True,), (timeout_s,))).__next__
-        self.__exit__ = lock.__exit__
+def _whole_id(cell_id: str, welcome: messages.Welcome) -> str:
+    return cell_id if cell_id.startswith("/") else welcome.id_prefix + cell_id
 
 
-_TURNS: Final = (Session._in_turn.__code__, Session.close.__code__)
-
-
-def _check_not_within_a_turn(session: Session) -> None:
-    """Refuse a nested `_Turn` in one thread, which would be a deadlock.
-
-    Raises
-    ------
-    BadRequest
-        This thread is already in a `_Turn` of the session.
-    """
-    frame: FrameType | None = sys._getframe(2)
-    while frame is not None:
-        if frame.f_code in _TURNS and frame.f_locals.get("self") is session:
-            raise BadRequest(
-                "this client is in the middle of a request, which a signal handler has interrupted to use it",
-                hint="have the handler set a flag or raise an exception, or use another client there",
-            )
-        frame = frame.f_back
+TURNS.update(function.__code__ for function in (Session._take, Session._report_unmapped, Session._connected))
 
 
 _sessions: Final[list[weakref.ref[Session]]] = []

@@ -56,8 +56,6 @@ from shmmap.protocol.events import Epoch
 if TYPE_CHECKING:
     from shmmap.daemon.map.published_origin import PublishedOrigin
 
-__all__ = ["Service"]
-
 LOOK_S: Final = 1.0
 """Interval of checking whether the sockets' files still exist."""
 LAST_WORDS_S: Final = 0.2
@@ -179,6 +177,8 @@ class Service:
                 ("answers", live),
             ]
         )
+        if memory.preparer is not None:
+            tasks.append(("loaders", memory.preparer))
         if elsewhere is not None:
             tasks += self._tasks_of(elsewhere)
         self._handshake = handshake
@@ -331,7 +331,7 @@ class Service:
             self._reload()
         if self._elsewhere is not None:
             self._elsewhere.note_served(memory.cache.catalogue)
-            self._published.look(self._elsewhere)
+            self._published.look(self._elsewhere, self._memory.scheduler.link)
         catalogue = memory.cache.catalogue
         version = catalogue.map_version
         if version != memory.identity.map_version:
@@ -350,7 +350,7 @@ class Service:
 
     def _collect_reload(self, change: MapChange) -> None:
         if self._elsewhere is not None:  # before the reload is answered
-            self._published.look(self._elsewhere)
+            self._published.look(self._elsewhere, self._memory.scheduler.link)
         change.collect()
 
     def _status(self) -> str:

@@ -43,22 +43,6 @@ else:
 if TYPE_CHECKING:
     from shmmap.daemon.config_live import LiveSettings
 
-__all__ = [
-    "DROPPED",
-    "RENAMED",
-    "ROWS",
-    "SECTIONS",
-    "SYSTEM_CONFIG_FILE",
-    "DaemonConfig",
-    "Setting",
-    "example_file",
-    "installed_config_file",
-    "load_config",
-    "option_of",
-    "read_settings_file",
-    "trace_settings",
-]
-
 SYSTEM_CONFIG_FILE: Final = "/etc/shmmap/shmmap.toml"
 MAX_BYTES: Final = 1 << 20
 _KEY: Final = re.compile(r"""\s*(?:"([^"]+)"|'([^']+)'|([A-Za-z0-9_-]+))\s*[.=]|\s*\[+\s*([A-Za-z0-9_-]+)""")
@@ -90,6 +74,18 @@ class Setting(NamedTuple):
 def _quota(text: str) -> float:
     """Parse a fraction of the budget, or a size."""
     return float(text) if text.replace(".", "").isdigit() else float(parse_bytes(text))
+
+
+def _specs(text: str) -> tuple[str, ...]:
+    """Split a variable's list of layer specs at the commas outside of brackets."""
+    found, depth = [""], 0
+    for letter in text:
+        depth += (letter == "(") - (letter == ")")
+        if letter == "," and not depth:
+            found.append("")
+        else:
+            found[-1] += letter
+    return tuple(spec.strip() for spec in found if spec.strip())
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,6 +143,16 @@ class DaemonConfig:
         "root of trust: take only versions that are signed under it, and none older than one taken before",
         metavar="ROOT.json",
         unset="the version that the map's origin names is taken unverified",
+    )
+    link_rate: float = setting(
+        0.0,
+        "most of the link that the map's cells may take, Mbit/s in all",
+        metavar="MBIT_S",
+        allowed=within(0.01, 1e6, "Mbit/s"),
+        unset="what the link carries",
+    )
+    metered: bool = setting(
+        False, "fetch only cells that clients ask for: nothing ahead, and no list of cells that nothing needs"
     )
     accept_version: int = setting(
         0,
@@ -227,6 +233,14 @@ class DaemonConfig:
         allowed=at_least("0"),
         size="cache_size",
         unset="none are kept",
+    )
+    prepare: tuple[str, ...] = setting(
+        (),
+        "layers to compute for every cell of a map of files, such as ndt(leaf=2.0), and to keep in the disk "
+        "cache; one loader of the lowest priority does it while nothing else is loaded",
+        metavar="LAYER",
+        parse=_specs,
+        unset="a layer is computed when a client asks for it",
     )
     log_level: str = setting(
         "info",
@@ -347,6 +361,14 @@ def load_config(
         its origin.
     """
     found = trace_settings(flags, file=file, environ=environ)
+    prepare = found["prepare"]
+    if prepare.value and not found["cache_bytes"].value:
+        raise ConfigError(
+            f"{prepare.origin}: prepare keeps layers in the disk cache, and cache_size is 0",
+            key="prepare",
+            origin=prepare.origin,
+            hint="name a cache_size such as 8G, or prepare nothing",
+        )
     return DaemonConfig(**{name: one.value for name, one in found.items()})
 
 
@@ -379,6 +401,8 @@ def trace_settings(
         value = ROWS[name].checked(value, f"{origin}: {called}", key=name, origin=origin)
         settings[name] = Setting(value, origin)
     settings["live"] = _live(live_tables, live_flags)
+    if settings["prepare"].value:
+        settings["prepare"] = _prepare(*settings["prepare"])
     endpoint = settings["endpoint"]
     if endpoint.value and settings["instance"].origin == "default":
         # clients that know only the socket look for the segments of the instance named by it
@@ -398,6 +422,19 @@ def _no_setting(word: str, origin: str) -> ConfigError:
         return ConfigError(f"{origin}: {called} is gone: {why}", key=word, origin=origin, hint=hint)
     hint = near_hint(word, [*(row.called for row in ROWS.values()), "live"])
     return ConfigError(f"{origin}: unknown setting {word!r}", key=word, origin=origin, hint=hint)
+
+
+def _prepare(specs: tuple[str, ...], origin: str) -> Setting:
+    """Return the canonical forms of the layers to prepare."""
+    from shmmap.layers.spec import canonical_layers
+
+    called = option_of("prepare") if origin == COMMAND_LINE else "prepare"
+    try:
+        return Setting(canonical_layers(specs), origin)
+    except BadRequest as error:
+        raise ConfigError(
+            f"{origin}: {called}: {error.message}", key="prepare", origin=origin, hint=error.hint
+        ) from None
 
 
 def _live(tables: Setting, flags: Sequence[Setting]) -> Setting:

@@ -15,8 +15,6 @@ from shmmap.chunks.occupancy import Occupancy
 from shmmap.daemon.config_table import Allowed, near_hint, rows_of, setting, within
 from shmmap.errors import ConfigError
 
-__all__ = ["LIVE_ROWS", "SERVICE_STATE", "LiveSettings", "live_directory", "live_settings", "state_directory"]
-
 SERVICE_STATE: Final = "/var/lib/shmmap/state"
 """Directory in which each instance of the installed service has its state (StateDirectory= of the units)."""
 

@@ -17,8 +17,6 @@ from typing import Any, Final, NamedTuple, TypeVar
 
 from shmmap.errors import ConfigError
 
-__all__ = ["Allowed", "Row", "at_least", "near_hint", "one_of", "parse_bytes", "rows_of", "setting", "within"]
-
 T = TypeVar("T")
 
 LARGEST_BYTES: Final = 1 << 62
@@ -26,7 +24,13 @@ _BEYOND: Final = 1 << 63
 """Larger than any limit; an integer may be too large for a float."""
 _SIZE: Final = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([kmgt]?)(i?)b?\s*", re.IGNORECASE)
 _TRUTHS: Final = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}
-_KINDS: Final = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
+_KINDS: Final = {
+    bool: "true or false",
+    int: "a whole number",
+    float: "a number",
+    str: "text",
+    tuple: "a list of texts",
+}
 _PARSERS: Final[dict[type, Callable[[str], Any]]] = {
     bool: lambda text: _TRUTHS[text.lower()],
     int: int,
@@ -117,7 +121,9 @@ class Row:
     def hint(self) -> str:
         """Text that lists the allowed values."""
         words, unset = self.allowed.words, self.unset
-        return f"{words}; 0: {unset}" if words and unset and not isinstance(self.default, str) else words
+        return (
+            f"{words}; 0: {unset}" if words and unset and not isinstance(self.default, str | tuple) else words
+        )
 
     def checked(self, value: Any, where: str, *, key: str, origin: str, as_text: bool = True) -> Any:
         """Return a value converted to the setting's type.
@@ -140,6 +146,8 @@ class Row:
                 value = (self.parse or (parse_bytes if self.size else _PARSERS[kind]))(value)
             elif kind is float and type(value) is int:
                 value = float(max(-_BEYOND, min(value, _BEYOND)))
+            elif kind is tuple and isinstance(value, list) and all(isinstance(one, str) for one in value):
+                value = tuple(value)
             if type(value) is not kind:
                 raise ValueError
         except ConfigError as error:
@@ -160,7 +168,7 @@ class Row:
             for power, unit in ((3, "G"), (2, "M"), (1, "K")):
                 if value % 1024**power == 0:
                     return f'"{value // 1024**power}{unit}"'
-        # settings are texts, numbers and booleans, which TOML writes as JSON does
+        # settings are texts, numbers, booleans and lists of texts, which TOML writes as JSON does
         return json.dumps(value, ensure_ascii=False)
 
     def option_help(self) -> str:
@@ -173,7 +181,7 @@ class Row:
         """Return the description for the example file, and the line that sets ``value`` or the default."""
         words = f"{self.help[:1].upper()}{self.help[1:]}."
         if self.unset:
-            words += f"  {'Empty' if isinstance(self.default, str) else '0'}: {self.unset}."
+            words += f"  {'Empty' if isinstance(self.default, str | tuple) else '0'}: {self.unset}."
         return words, f"{self.called} = {self.toml(self.default if value is None else value)}"
 
 

@@ -79,12 +79,19 @@ from shmmap.version import build_version
 if TYPE_CHECKING:
     from shmmap.daemon.map.published_origin import PublishedOrigin
 
-__all__ = ["run"]
-
 LIVE_S: Final = 1.5
 """How long points wait for live maps at the start: faulty live maps must not prevent serving points."""
 LIVE_ALONE_S: Final = 120.0
 """How long the daemon waits for live maps if it serves nothing else: kernels are compiled meanwhile."""
+_NOT_PUBLISHED: Final = {
+    "metadata": "",
+    "unit": "",
+    "vertical_unit": "",
+    "drop_noise": "",
+    "watch": "--poll SECONDS looks for new versions",
+    "prepare": "add layers with `shmmap prepare URL --shards 1/1` and `shmmap publish URL --join RUN`",
+}
+"""Settings that a published map does not have, and what to do instead."""
 SWITCH_S: Final = 0.0005
 """How long a thread that reloads the map may keep the serving loop waiting for the interpreter lock."""
 
@@ -153,7 +160,7 @@ def run(config: DaemonConfig) -> int:
         for problem in catalogue.problems:
             log.warning("problem in the map", what=problem)
         with signals.held():
-            fetched = _fetched_from(elsewhere) if elsewhere is not None else None
+            fetched = _fetched_from(elsewhere, config) if elsewhere is not None else None
             memory = MapInMemory(config, catalogue, directory, pins, path, mode, gid, early, fetched)
             stack.push(partial(_close, memory, signals))
         ledger = memory.cache.ledger
@@ -209,13 +216,9 @@ def _published(config: DaemonConfig) -> PublishedOrigin | None:
         )
     if not config.trust and not is_published(path):
         return None
-    for name in ("metadata", "unit", "vertical_unit", "drop_noise", "watch"):
+    for name, hint in _NOT_PUBLISHED.items():
         if getattr(config, name):
-            raise ConfigError(
-                f"{option_of(name)} is not for a published map",
-                key=name,
-                hint="--poll SECONDS looks for new versions" if name == "watch" else "",
-            )
+            raise ConfigError(f"{option_of(name)} is not for a published map", key=name, hint=hint)
     with needed_packages("a published map"):
         from shmmap.daemon.map.published_origin import PublishedOrigin
         from shmmap.origin.remote.opened_store import ServedFrom
@@ -235,10 +238,15 @@ def _published(config: DaemonConfig) -> PublishedOrigin | None:
         )
 
 
-def _fetched_from(origin: PublishedOrigin) -> FetchedFrom:
-    from shmmap.daemon.loading.published_reader import CONCURRENT_FETCHES
+def _fetched_from(origin: PublishedOrigin, config: DaemonConfig) -> FetchedFrom:
+    from shmmap.daemon.loading.link import Link
+    from shmmap.daemon.loading.published_reader import CONCURRENT_FETCHES, needed_bytes
 
-    return FetchedFrom(origin.served.words(), CONCURRENT_FETCHES)
+    link = None
+    if is_url(origin.path):
+        cap_bytes_s = config.link_rate * 1e6 / 8
+        link = Link(origin.arrivals, cap_bytes_s=cap_bytes_s, metered=config.metered)
+    return FetchedFrom(origin.served.words(), CONCURRENT_FETCHES, link, needed_bytes)
 
 
 def _end_threads(origin: PublishedOrigin) -> None:

@@ -30,8 +30,11 @@ from shmmap.daemon.host.memory import (
 )
 from shmmap.daemon.live.messages import Begin
 from shmmap.daemon.loading.adoption import Adoption
+from shmmap.daemon.loading.link import Link
 from shmmap.daemon.loading.prepared_parent import Early, PreparedParent
+from shmmap.daemon.loading.preparer import DEADLINE, Preparer, refuse_far_reaching
 from shmmap.daemon.loading.scheduler import Scheduler
+from shmmap.daemon.loading.worker_messages import Job
 from shmmap.daemon.loading.worker_pool import WorkerPool
 from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.pins.probe import PinSource
@@ -48,8 +51,6 @@ from shmmap.segment.process_limits import limit_behind
 from shmmap.statistics.identity import DaemonIdentity, pid_namespace, start_time_ticks
 from shmmap.statistics.writer import StatisticsWriter
 from shmmap.version import build_version
-
-__all__ = ["FetchedFrom", "MapInMemory", "place_live_maps", "share_of_live_maps"]
 
 CEILING_BYTES: Final = 1 << 30
 PART: Final = 8
@@ -188,10 +189,22 @@ def _without_huge_pages(path: str) -> str:
 
 
 class FetchedFrom(NamedTuple):
-    """Arguments with which loaders fetch cells, and the number of cells each loader fetches concurrently."""
+    """How loaders fetch cells.
+
+    Attributes
+    ----------
+    words
+        Arguments of loaders.
+    places
+        Number of cells that each loader fetches concurrently.
+    link, needed_bytes
+        Budget of the link, and what a job fetches over it; None where the map is in a directory.
+    """
 
     words: tuple[str, ...]
     places: int
+    link: Link | None
+    needed_bytes: Callable[[Job], int]
 
 
 class MapInMemory:
@@ -207,7 +220,8 @@ class MapInMemory:
     Raises
     ------
     ConfigError
-        The budget is impossible on this machine, or a limit prevents writing to the directory.
+        The budget is impossible on this machine, a limit prevents writing to the directory, or a layer to
+        prepare would use too many neighbouring cells.
     CannotStart
         The directory is full, or another file has a needed name.
     InstanceBusy
@@ -228,6 +242,7 @@ class MapInMemory:
         *,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        refuse_far_reaching(config.prepare, catalogue)
         self.directory = directory
         epoch = secrets.randbits(63) | 1
         self.identity = _identity(config, catalogue, directory.path, socket_path, epoch)
@@ -259,7 +274,6 @@ class MapInMemory:
                 mode=mode,
                 gid=gid,
                 starting=True,
-                reserve=ledger.add_overhead,
             )
         with contextlib.ExitStack() as undo:
             undo.callback(self.statistics.close)  # its name must not stay if a later step fails
@@ -291,26 +305,26 @@ class MapInMemory:
             )
             parent = PreparedParent(settings, self.watched, early)
             parent.start()  # its imports run while this process continues to start
-            pool = partial(
-                WorkerPool,
-                config.loaders(),
-                directory,
-                parent,
-                config.load_timeout_s,
-                self.watched,
-                places=origin.places if origin is not None else 1,
-            )
+            pool = partial(WorkerPool, directory=directory, parent=parent, watched=self.watched)
             self.map_switch = MapSwitch(self.cache)
             self.waiting = WaitingList(ledger)
             self.scheduler = Scheduler(
                 self.cache,
                 self.map_switch,
-                pool,
+                lambda on_message: pool(
+                    limit=config.loaders(),
+                    deadline_s=config.load_timeout_s,
+                    on_message=on_message,
+                    places=origin.places if origin is not None else 1,
+                ),
                 self.waiting,
                 clock=clock,
                 prefetch_share=config.prefetch_share,
                 outage_tolerance_s=config.outage_tolerance_s,
+                link=origin.link if origin is not None else None,
+                needed_bytes=origin.needed_bytes if origin is not None else None,
             )
+            self.preparer = _preparer(config, self.cache, self.scheduler, pool, clock)
             self.adoption = Adoption(self.cache, self.scheduler.loads, self.scheduler.misplaced)
             self.adoption.take_over(clock())
             events = self.cache.events
@@ -326,7 +340,30 @@ class MapInMemory:
             stack.callback(self.cache.close, keep=keep)
             stack.callback(self.adoption.close, keep=keep)
             stack.callback(self.scheduler.pool.close)
+            if self.preparer is not None:
+                stack.callback(self.preparer.close)
             stack.callback(self.cache.events.close)
+
+
+def _preparer(
+    config: DaemonConfig,
+    cache: CellCache,
+    scheduler: Scheduler,
+    pool: partial[WorkerPool],
+    clock: Callable[[], float],
+) -> Preparer | None:
+    """Return what prepares layers; None if the settings name none."""
+    if not config.prepare:
+        return None
+    deadline_s = DEADLINE * config.load_timeout_s
+    return Preparer(
+        cache,
+        scheduler,
+        config.prepare,
+        config.cache_bytes,
+        lambda on_message: pool(limit=1, deadline_s=deadline_s, on_message=on_message),
+        clock=clock,
+    )
 
 
 def _identity(
@@ -346,6 +383,8 @@ def _identity(
         library_version=build_version(),
         started_unix_ns=time.time_ns(),
         frame_id=catalogue.frame_id,
+        prepare=" ".join(config.prepare),
+        live=" ".join(one.name for one in config.live),
     )
 
 

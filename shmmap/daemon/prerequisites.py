@@ -19,17 +19,6 @@ from shmmap.logfmt import log
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.process_limits import file_size_limit
 
-__all__ = [
-    "access_of_segments",
-    "account_name",
-    "check_file_size_limit",
-    "choose_pins",
-    "give_back_large_tables",
-    "group_id",
-    "import_ahead",
-    "raise_descriptor_limit",
-]
-
 _M_MMAP_THRESHOLD: Final = -3
 _LARGE_BYTES: Final = 1 << 20
 

@@ -10,8 +10,6 @@ from typing import Final, NamedTuple
 from shmmap.segment.directory import is_full
 from shmmap.segment.version import Stamp
 
-__all__ = ["SPACE_CODES", "Failure", "Key", "Load", "Resident", "Retired", "failure_code"]
-
 SPACE_CODES: Final = frozenset({"over_budget", "no_space"})
 """Failures for lack of memory: they may be retried when memory is released."""
 
@@ -34,7 +32,8 @@ class Resident:
 
     ``checked`` is false for a segment of a previous run until its bytes have been compared with their
     checksums; until then it is not handed out.  ``prefetched`` is true for a prefetched segment until a
-    client asks for it.  ``handle`` and ``stale_handle`` are encoded once for all replies.  ``sessions`` are
+    client asks for it, ``spare`` for one that was loaded into spare memory and only spare requests asked for.
+    ``handle`` and ``stale_handle`` are encoded once for all replies.  ``sessions`` are
     the slots of the sessions that hold it.  ``place`` is its position among all segments of its size.
     ``deferred_s`` is how long it was deferred when it was last found in use.
     """
@@ -54,6 +53,7 @@ class Resident:
     hits: int = 0
     checked: bool = True
     prefetched: bool = False
+    spare: bool = False
     sessions: set[int] = field(default_factory=set)
     place: int = -1
     deferred_s: float = 0.0
@@ -85,8 +85,10 @@ class Load:
     the job, and ``version`` is the version that follows from them.  ``computed`` means that the layer is
     computed, which may take long.  ``payer`` is the asker whose turn was used, ``charged_s`` the loader time
     charged in advance, ``spent_s`` the loader time used, and ``took_s`` the total time, fetching included.
+    ``link_bytes`` is what it fetches from a remote origin.
     ``losses`` counts loaders that were lost through no fault of this load.  ``prefetch`` means that no client
-    has asked for it yet, ``unread`` that its source could not be read.
+    has asked for it yet, ``spare`` that only spare requests have, ``unread`` that its source could not be
+    read.
     """
 
     key: Key
@@ -106,9 +108,11 @@ class Load:
     charged_s: float = 0.0
     spent_s: float = 0.0
     took_s: float = 0.0
+    link_bytes: int = 0
     losses: int = 0
     computed: bool = False
     prefetch: bool = False
+    spare: bool = False
     unread: bool = False
 
 

@@ -8,7 +8,6 @@ and READY=1 at the end.
 
 from __future__ import annotations
 
-import contextlib
 import math
 import os
 import re
@@ -16,41 +15,43 @@ import signal
 import socket
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Mapping, MutableMapping
 from types import TracebackType
 from typing import Final, NamedTuple
 
 from shmmap.errors import ConfigError
 
-__all__ = [
-    "FIRST_FD",
-    "ActivatedSocket",
-    "MoreTime",
-    "ServiceManager",
-    "notify",
-    "status_line",
-    "take_activated_socket",
-    "watchdog_interval_s",
-]
-
 STATUS_EVERY_S: Final = 2.0
 """Minimum time between status lines: each one wakes programs that listen to the service manager."""
 
+_MAX_PENDING: Final = 8  # changes of state; the newest say all
 
-def notify(*lines: str) -> None:
+
+def notify(*lines: str) -> bool:
     """Send ``KEY=value`` lines to ``NOTIFY_SOCKET`` (sd_notify(3)), if it is set.
 
     A line break in a value (a path may contain one) becomes a blank, since it would start another line.
+
+    Returns
+    -------
+    bool
+        False if the service manager has so much unread that sending would block: it may hang, the daemon
+        may not.
     """
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address.startswith(("/", "@")):
-        return
-    with (
-        contextlib.suppress(OSError),
-        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as channel,
-    ):
-        text = "\n".join(line.replace("\n", " ") for line in lines)
-        channel.sendto(text.encode(errors="replace"), re.sub("^@", "\0", address))
+        return True
+    kind = socket.SOCK_DGRAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK
+    try:
+        with socket.socket(socket.AF_UNIX, kind) as channel:
+            text = "\n".join(line.replace("\n", " ") for line in lines)
+            channel.sendto(text.encode(errors="replace"), re.sub("^@", "\0", address))
+    except BlockingIOError:
+        return False
+    except OSError:
+        pass  # there is no such service manager
+    return True
 
 
 def watchdog_interval_s(environ: Mapping[str, str]) -> float:
@@ -85,7 +86,7 @@ class ServiceManager:
     environ
         Environment of this process: ``WATCHDOG_USEC`` and ``WATCHDOG_PID`` are used.
     send
-        Sends ``KEY=value`` lines.
+        Sends ``KEY=value`` lines; returns False where that would block.
 
     Attributes
     ----------
@@ -93,47 +94,56 @@ class ServiceManager:
         Whether this process is a service of systemd's, which starts it again after a failure.
     """
 
-    def __init__(self, environ: Mapping[str, str] = os.environ, send: Callable[..., None] = notify) -> None:
+    def __init__(self, environ: Mapping[str, str] = os.environ, send: Callable[..., bool] = notify) -> None:
         self._send = send
         self._feed_every_s = watchdog_interval_s(environ)
         self._feed_at_s = 0.0 if math.isfinite(self._feed_every_s) else math.inf
         self._status = ""
         self._status_s = -math.inf
         self._reloads = 0
+        self._pending: deque[tuple[str, ...]] = deque(maxlen=_MAX_PENDING)
         self.starts_again = bool(environ.get("NOTIFY_SOCKET")) and bool(environ.get("INVOCATION_ID"))
 
     def ready(self, status: str) -> None:
         """Report that serving starts."""
-        self._send("READY=1", f"STATUS={status}", f"MAINPID={os.getpid()}")
+        self._report("READY=1", f"STATUS={status}", f"MAINPID={os.getpid()}")
 
     def beat(self, now_s: float, status: Callable[[], str]) -> None:
         """Feed the watchdog and send a new status line; the serving loop calls it a few times a second."""
-        if now_s >= self._feed_at_s:
+        if not self._report():
+            return
+        if now_s >= self._feed_at_s and self._send("WATCHDOG=1"):
             self._feed_at_s = now_s + self._feed_every_s
-            self._send("WATCHDOG=1")
         if not self._reloads and now_s - self._status_s >= STATUS_EVERY_S:
             self._status_s = now_s
             line = status()
-            if line != self._status:
+            if line != self._status and self._send(f"STATUS={line}"):
                 self._status = line
-                self._send(f"STATUS={line}")
+
+    def _report(self, *lines: str) -> bool:
+        """Send a change of state after those that could not be sent; return whether none is left."""
+        if lines:
+            self._pending.append(lines)
+        while self._pending and self._send(*self._pending[0]):
+            self._pending.popleft()
+        return not self._pending
 
     def reloading(self) -> None:
         """Report that a reload has begun; each call is followed by one of `reloaded`."""
         self._reloads += 1
         now_us = time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000
-        self._send("RELOADING=1", f"MONOTONIC_USEC={now_us}", "STATUS=reading the map again")
+        self._report("RELOADING=1", f"MONOTONIC_USEC={now_us}", "STATUS=reading the map again")
 
     def reloaded(self, outcome: str) -> None:
         """Report that a reload has ended, successful or not; ready once no other reload runs."""
         self._reloads -= 1
         self._status = ""
         if not self._reloads:
-            self._send("READY=1", f"STATUS={outcome}")
+            self._report("READY=1", f"STATUS={outcome}")
 
     def stopping(self, why: str) -> None:
         """Report that the daemon stops serving."""
-        self._send("STOPPING=1", f"STATUS={why}")
+        self._report("STOPPING=1", f"STATUS={why}")
 
     def failed(self, message: str) -> None:
         """Report that the daemon cannot start; the message stays visible in ``systemctl status``."""
@@ -163,7 +173,7 @@ class MoreTime:
         Interval of the requests, seconds.
     """
 
-    def __init__(self, send: Callable[..., None], what: str, every_s: float = EXTEND_EVERY_S) -> None:
+    def __init__(self, send: Callable[..., bool], what: str, every_s: float = EXTEND_EVERY_S) -> None:
         self._send = send
         self._what = what
         self._every_s = every_s

@@ -29,8 +29,6 @@ from shmmap.daemon.turns import WatchedDescriptors
 from shmmap.protocol.events import LongTurn
 from shmmap.statistics.writer import StatisticsWriter
 
-__all__ = ["BackgroundTask", "ServingLoop"]
-
 CLIENTS: Final = "clients"
 TURN_NS: Final = 50_000
 """Processor time after which a turn begins only requests, and no other step."""

@@ -8,10 +8,8 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Final, Generic, TypeVar
 
-__all__ = ["BATCH", "TURN_S", "Pace", "Walk", "WatchedDescriptors", "batched"]
-
 DESCRIPTORS_PER_TURN: Final = 16
-"""Descriptors returned per poll; the kernel begins with those not returned last time."""
+"""Descriptors returned per poll, and called again; the kernel begins with those not returned last time."""
 
 
 class WatchedDescriptors:
@@ -38,7 +36,7 @@ class WatchedDescriptors:
         self._epoll.modify(fd, reading * select.EPOLLIN | writing * select.EPOLLOUT)
 
     def call_again(self, fd: int) -> None:
-        """Call a descriptor's callback in the next turn, whether it is ready or not."""
+        """Call a descriptor's callback in one of the next turns, whether it is ready or not."""
         self._again.append(fd)
 
     def unwatch(self, fd: int) -> None:
@@ -50,7 +48,7 @@ class WatchedDescriptors:
 
     def poll(self, timeout_s: float) -> list[int]:
         """Wait until descriptors are ready, at most ``timeout_s``, and return them."""
-        again, self._again = self._again, []
+        again, self._again = self._again[:DESCRIPTORS_PER_TURN], self._again[DESCRIPTORS_PER_TURN:]
         ready = self._epoll.poll(0 if again else timeout_s, DESCRIPTORS_PER_TURN)
         self.wakes += bool(again or ready)
         return [*again, *(fd for fd, _events in ready)]

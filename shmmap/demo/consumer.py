@@ -22,8 +22,6 @@ from numpy.typing import NDArray
 from shmmap.errors import NoAnswer, ShmmapError
 from shmmap.geometry import Circle, distance_to_boxes
 
-__all__ = ["TASKS", "Pose", "Step", "StepReport", "main"]
-
 Points: TypeAlias = NDArray[Any]
 
 _TIMEOUT_S: Final = 30.0

@@ -9,11 +9,13 @@ removed at the end.
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from shmmap.client.client import connect
 from shmmap.demo.demo_town import (
     DemoSettings,
     TownMap,
@@ -28,7 +30,6 @@ from shmmap.demo.drive import (
     OutageResult,
     drive,
     drive_through_outage,
-    statistics_now,
 )
 from shmmap.demo.localization import (
     LocalizationResult,
@@ -43,8 +44,6 @@ from shmmap.processes.interrupts import scratch_directory
 from shmmap.protocol.rows import CellRow
 from shmmap.segment.directory import DEFAULT_SHM_DIR
 from shmmap.testing.daemon_process import DaemonProcess
-
-__all__ = ["DemoResult", "Round", "run_demo"]
 
 _PREFETCH_SHARE: Final = "0.02"
 """The drive is faster than any vehicle; prefetching for its speed would load the whole town."""
@@ -94,6 +93,16 @@ class DemoResult:
             (last.shared.total_bytes - first.shared.total_bytes) / more,
             (last.private.total_bytes - first.private.total_bytes) / more,
         )
+
+    @property
+    def pays_from(self) -> int | None:
+        """Number of processes from which sharing takes less memory; None if it never does."""
+        shared, private = self.one_more_bytes
+        if shared >= private:
+            return None
+        first = self.rounds[0]
+        lost = first.shared.total_bytes - first.private.total_bytes
+        return first.consumers + max(0, math.floor(lost / (private - shared)) + 1)
 
 
 def run_demo(settings: DemoSettings, progress: Progress, *, map_dir: str | None = None) -> DemoResult:
@@ -158,7 +167,8 @@ def run_demo(settings: DemoSettings, progress: Progress, *, map_dir: str | None 
                 shared = drive(fleet, town.route, settings.pace_s, progress)
                 rounds.append(Round(count, shared, private))
                 if count == settings.counts[-1]:
-                    resident = statistics_now(daemon).cells
+                    with connect(daemon.endpoint, name="shmmap demo") as client:
+                        resident = client.list_cells()
                     progress.stage(f"Killing the daemon while {one} keep driving", len(town.onward))
                     outage = drive_through_outage(fleet, daemon, town.onward, progress)
         found = None if missing else localize(town.path, options, work, progress)

@@ -24,8 +24,6 @@ from shmmap.quantities import format_bytes, format_duration
 from shmmap.statistics.reader import Snapshot, read_statistics
 from shmmap.testing.daemon_process import DaemonProcess
 
-__all__ = ["DriveResult", "Fleet", "OutageResult", "drive", "drive_through_outage", "statistics_now"]
-
 _TIMEOUT_S: Final = 60.0
 _SHOWN: Final = 8  # consumers shown on the screen
 _POLL_S: Final = 0.02

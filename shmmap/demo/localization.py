@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-__all__ = ["LocalizationResult", "localize", "main", "missing_package", "prepare", "wait_prepared"]
-
 _PROGRAM: Final = "shmmap_clients.ndt_scan_matcher"
 _WINDOW_METRES: Final = 80.0
 _SEEN_METRES: Final = 45.0  # range of the LiDAR

@@ -23,8 +23,6 @@ from shmmap.errors import InternalError
 from shmmap.processes.interrupts import interrupts_later
 from shmmap.testing.daemon_process import wait_readable, without_settings
 
-__all__ = ["ProcessMemory", "Program", "Progress", "cpu_seconds", "descendants", "process_memory"]
-
 _LAST_WORDS: Final = 2000  # characters of stderr
 _USER: Final = 11  # utime, stime, cutime, cstime: their place in proc(5), counted after the command
 _TICKS_PER_S: Final = os.sysconf("SC_CLK_TCK")
@@ -135,12 +133,6 @@ class Program:
             stdin.flush()
         except BrokenPipeError:
             raise self._ended_early() from None
-
-    def end_input(self) -> None:
-        """Close the program's stdin."""
-        stdin = self._started.stdin
-        assert stdin is not None  # noqa: S101  it is a pipe
-        stdin.close()
 
     def read_line(self, timeout_s: float) -> str:
         """Return the next line of the program's stdout."""

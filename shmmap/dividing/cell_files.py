@@ -28,8 +28,6 @@ from shmmap.formats.pcd.writer import pcd_header
 from shmmap.origin.metadata import METADATA_NAME, metadata_text
 from shmmap.private_directory import open_own
 
-__all__ = ["CellFiles", "Slot", "pcd_fields", "raise_open_files_limit", "write_at", "write_metadata"]
-
 _ALIGNMENT: Final = 64
 _SPARE_DESCRIPTORS: Final = 128
 _MAX_POINTS: Final = (1 << 32) - 1

@@ -21,8 +21,6 @@ from shmmap.origin.map_report import LINK_NAME, read_report
 from shmmap.processes.start_child import channel_to_parent
 from shmmap.progress import NoProgress
 
-__all__ = ["main"]
-
 _NICENESS: Final = 10  # clients of the daemon have priority
 _REPORT_EVERY_S: Final = 1.0
 

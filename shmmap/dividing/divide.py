@@ -39,8 +39,6 @@ from shmmap.formats.source_file import refusal
 from shmmap.origin.map_report import DividedMap, far_cells_notes, write_report
 from shmmap.progress import NoProgress, Progress
 
-__all__ = ["divide"]
-
 _CELLS: Final = "pointcloud_map.pcd"
 _JOURNAL: Final = "pieces"
 

@@ -22,8 +22,6 @@ from shmmap.errors import BadRequest
 from shmmap.formats.pcd.writer import write_pcd
 from shmmap.progress import Progress
 
-__all__ = ["reduce_voxels", "thin_out", "write_encoded"]
-
 _BYTES_PER_POINT: Final = 96
 """Memory per point that reducing takes, besides two copies of the points."""
 

@@ -33,15 +33,6 @@ from shmmap.formats.coordinate_system import (
 from shmmap.formats.point_checks import FLOAT32_REACH_M
 from shmmap.formats.source_file import refusal
 
-__all__ = [
-    "Frame",
-    "InputUnits",
-    "Translation",
-    "choose_frame",
-    "choose_units",
-    "frame_between",
-]
-
 _SCAN_POINTS: Final = 1 << 20
 _ROUNDING: Final = 1.001  # bounds in headers are rounded
 

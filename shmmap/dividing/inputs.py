@@ -15,15 +15,6 @@ from shmmap.origin.map_report import REPORT_NAME
 from shmmap.origin.metadata import METADATA_NAME
 from shmmap.quantities import format_bytes
 
-__all__ = [
-    "InputFile",
-    "check_output_directory",
-    "check_output_place",
-    "check_space",
-    "check_unchanged",
-    "find_inputs",
-]
-
 _MAP_PARTS = frozenset({"pointcloud_map.pcd", METADATA_NAME, REPORT_NAME})
 
 

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from shmmap.compiling import compiled
 
-__all__ = ["NOWHERE", "assign_cells", "count_cells", "scatter_rows"]
-
 NOWHERE: Final = -(1 << 31)
 """Index of a point that is not finite."""
 

@@ -17,8 +17,6 @@ from typing import Final
 
 from shmmap.errors import BadRequest
 
-__all__ = ["MAX_DECIMALS", "CellLattice"]
-
 MAX_DECIMALS: Final = 6  # so that corners up to 4.5e9 m are exact integers in float64
 _EXACT: Final = 1 << 53  # beyond, an integer is not exact in float64
 

@@ -21,8 +21,6 @@ from shmmap.dividing.settings import DivideSettings, lattice_of
 from shmmap.dividing.workspace import Workspace
 from shmmap.errors import BadRequest
 
-__all__ = ["MapWriter", "WrittenMap"]
-
 Columns = Mapping[str, NDArray[Any]]
 
 _MAX_INDEX: Final = 1 << 30

@@ -31,8 +31,6 @@ from shmmap.formats.point_checks import LasChecks
 from shmmap.origin.map_report import read_report
 from shmmap.progress import NoProgress, Progress
 
-__all__ = ["MERGED_ENCODINGS", "MergedCloud", "merge"]
-
 MERGED_ENCODINGS: Final = ("binary", "ascii")
 """Encodings that can be written without all points in memory."""
 

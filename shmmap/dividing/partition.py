@@ -24,8 +24,6 @@ from shmmap.dividing.lattice import CellLattice
 from shmmap.dividing.sources import word_view
 from shmmap.errors import BadRequest
 
-__all__ = ["Partition", "block_points_for", "worker_count"]
-
 _WINDOW_CELLS: Final = 1 << 22  # up to this many cells between a block's extremes, a dense table counts
 _MAX_BLOCK_POINTS: Final = 1 << 23
 _MIN_BLOCK_POINTS: Final = 1 << 14

@@ -37,8 +37,6 @@ from shmmap.origin.map_report import LINK_NAME, read_report
 from shmmap.private_directory import PRIVATE, NotPrivate, opened_private, require_private
 from shmmap.processes.start_child import MAX_PACKET_BYTES, how_ended, start_child
 
-__all__ = ["DividedCloud", "find_origin"]
-
 _RECIPE: Final = "cells of 20 m, frame moved, 3"  # changes if the same cloud is divided differently
 _KEPT_CLOUDS: Final = 8
 _MORE_TIME_USEC: Final = 60_000_000
@@ -59,7 +57,7 @@ def find_origin(
     unit: str = "",
     vertical_unit: str = "",
     drop_noise: bool = False,
-    notify: Callable[..., None] = _notify_no_one,
+    notify: Callable[..., object] = _notify_no_one,
 ) -> MapOrigin:
     """Return the origin of the map at a path: a map, or a cloud that must be divided first.
 
@@ -127,7 +125,7 @@ class DividedCloud:
         *,
         strict: bool = False,
         how: tuple[str, str, str] = ("", "", ""),
-        notify: Callable[..., None] = _notify_no_one,
+        notify: Callable[..., object] = _notify_no_one,
     ) -> None:
         self.path = path
         self._how = how

@@ -14,14 +14,6 @@ from shmmap.dividing.sources import AXES
 from shmmap.errors import BadRequest
 from shmmap.formats.pcd.header import ENCODINGS
 
-__all__ = [
-    "MIN_MEMORY_BYTES",
-    "DivideSettings",
-    "lattice_of",
-    "memory_left",
-    "peak_memory_bytes",
-]
-
 
 @dataclass(frozen=True, slots=True)
 class DivideSettings:

@@ -20,20 +20,6 @@ from shmmap.formats.pcd.reader import PcdReader, expanded_blocks
 from shmmap.formats.point_checks import PointChecks
 from shmmap.formats.source_file import refusal
 
-__all__ = [
-    "AXES",
-    "NO_MOVE",
-    "NO_SCALE",
-    "Bound3",
-    "RowLayout",
-    "Source",
-    "common_rows",
-    "field_types",
-    "open_source",
-    "with_axes",
-    "word_view",
-]
-
 AXES: Final = ("x", "y", "z")
 NO_MOVE: Final = (0.0, 0.0, 0.0)
 NO_SCALE: Final = (1.0, 1.0)

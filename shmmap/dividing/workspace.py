@@ -29,8 +29,6 @@ from shmmap.errors import InstanceBusy, ShmmapError
 from shmmap.formats.durable_file import flush_directory, writing_errors
 from shmmap.private_directory import PRIVATE, NotPrivate, open_own, open_private, within
 
-__all__ = ["Workspace"]
-
 _STATE: Final = "state.json"
 _LOCK: Final = "lock"
 _EXCHANGES: Final = 100  # times that the directory may be removed by its last holder, or exchanged

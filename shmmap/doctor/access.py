@@ -17,7 +17,8 @@ from itertools import islice
 from typing import Any, Final
 
 from shmmap.daemon.prerequisites import account_name
-from shmmap.doctor.diagnosis import ANSWER_S, Diagnosis
+from shmmap.doctor.daemon_lists import ANSWER_S
+from shmmap.doctor.diagnosis import Diagnosis
 from shmmap.doctor.verdicts import Finding, fail, ok, outage_so_far, skip, warn
 from shmmap.errors import (
     DaemonUnreachable,
@@ -31,17 +32,6 @@ from shmmap.origin.remote.store import is_url
 from shmmap.protocol.endpoint import fallback_runtime_dir, runtime_dirs, why_not_used
 from shmmap.quantities import counted
 from shmmap.segment.pins import has_slot
-
-__all__ = [
-    "check_group",
-    "check_map_access",
-    "check_ros_bridge",
-    "check_socket",
-    "group_name",
-    "groups_of",
-    "is_in",
-    "paths_of_service",
-]
 
 LOOKED_AT: Final = 256
 """Files of a map whose permissions are checked; those of one map rarely differ."""
@@ -152,7 +142,7 @@ def _access(path: str) -> str:
 def check_map_access(diagnosis: Diagnosis) -> Finding:
     """Check that the daemon can read the map, whether a directory or a URL."""
     path = diagnosis.map_path
-    if not path and (diagnosis.config.live or (diagnosis.seen is not None and diagnosis.seen.live)):
+    if not path and (diagnosis.config.live or diagnosis.live_names):
         return ok("none is served: the daemon keeps live maps alone")
     if not path:
         return warn("no map is named", "set map_path, or give `shmmap serve MAP`")
@@ -253,7 +243,10 @@ def _closed_to(uid: int, path: str, *, parents: bool) -> str:
     return ""
 
 
-_BRIDGE_ADVICE: Final = "start these nodes with RMW_IMPLEMENTATION=rmw_cyclonedds_cpp"
+_BRIDGE_ADVICE: Final = (
+    "with ROS use the node (shmmap-ros-node), which serves every implementation;"
+    " or start these nodes with RMW_IMPLEMENTATION=rmw_cyclonedds_cpp"
+)
 _MAX_BYTES: Final = 1 << 16
 _NAMED: Final = 3
 _LOCKED: Final = 0

@@ -8,15 +8,14 @@ import time
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final
 
-from shmmap.doctor.diagnosis import ANSWER_S, Diagnosis
+from shmmap.doctor.daemon_lists import ANSWER_S
+from shmmap.doctor.diagnosis import Diagnosis
 from shmmap.doctor.verdicts import Finding, cache_verdict, fail, ok, outage_so_far, warn
 from shmmap.errors import ShmmapError
 from shmmap.quantities import counted, format_bytes, format_duration
 
 if TYPE_CHECKING:
     from shmmap.statistics.identity import DaemonIdentity
-
-__all__ = ["causes", "check_cache", "check_cells", "check_prefetching", "failing_cells"]
 
 SHORT: Final = ("out of memory", "of memory that a loader may use")
 """Texts in messages of loads that failed for lack of memory."""

@@ -19,6 +19,7 @@ from shmmap.doctor.daemon import (
     check_pins,
     check_reload,
 )
+from shmmap.doctor.daemon_lists import DaemonLists
 from shmmap.doctor.diagnosis import Diagnosis, Machine, answering_at
 from shmmap.doctor.live import check_live_disk, check_live_maps, check_live_memory
 from shmmap.doctor.memory import (
@@ -40,8 +41,6 @@ from shmmap.errors import ShmmapError
 from shmmap.segment.directory import DEFAULT_SHM_DIR
 from shmmap.segment.names import usual_directory
 from shmmap.statistics.reader import read_statistics
-
-__all__ = ["CHECKS", "diagnose", "examine"]
 
 CHECKS: Final[dict[str, Callable[[Diagnosis], Finding]]] = {  # in the order of the output
     "daemon": check_daemon,
@@ -85,6 +84,9 @@ def examine(config: DaemonConfig, file: str, machine: Machine | None = None) -> 
         seen, unreadable = None, error.message
     except OSError as error:
         seen, unreadable = None, f"{config.shm_dir}: {error.strerror}"
+    if seen is not None and seen.identity is not None:
+        with DaemonLists("shmmap doctor") as lists:
+            lists.add_to(seen, clients=bool(seen.identity.live))
     if seen is not None and seen.identity is not None and not (config.endpoint or config.runtime_dir):
         path = seen.identity.endpoint
     else:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import os
 import re
 import resource
@@ -13,22 +14,13 @@ from typing import Final
 from shmmap.daemon.pins.probe import probe_pins
 from shmmap.daemon.prerequisites import account_name
 from shmmap.doctor.diagnosis import Diagnosis, Machine, answering_at
-from shmmap.doctor.verdicts import Finding, fail, ok, warn
+from shmmap.doctor.verdicts import Finding, fail, ok, state_problem, warn
 from shmmap.errors import CannotStart, ShmmapError
 from shmmap.quantities import counted, format_bytes
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.names import usual_directory
 from shmmap.statistics.reader import read_statistics
 from shmmap.version import build_version
-
-__all__ = [
-    "check_daemon",
-    "check_descriptors",
-    "check_leftovers",
-    "check_logind",
-    "check_pins",
-    "check_reload",
-]
 
 SYSTEM_UIDS: Final = 999
 """logind spares accounts up to this id (SYS_UID_MAX of Debian, Ubuntu, Fedora and systemd)."""
@@ -41,7 +33,7 @@ def check_daemon(diagnosis: Diagnosis) -> Finding:
     """Check that the daemon runs, answers and matches the installed version."""
     if diagnosis.seen is None:
         return warn(diagnosis.unreadable, "join its group, or run it with sudo")
-    identity, state = diagnosis.seen.identity, diagnosis.seen.state
+    identity = diagnosis.seen.identity
     instance = diagnosis.config.instance
     if diagnosis.awaits_first_client:
         return ok(f"instance {instance} does not run; its first client starts it")
@@ -52,22 +44,10 @@ def check_daemon(diagnosis: Diagnosis) -> Finding:
         )
     if identity is None:
         return warn(f"instance {instance} does not run", "`systemctl start shmmapd` or `shmmap serve MAP`")
-    shown = {"stopped": "paused (SIGSTOP or a debugger)"}.get(state, state)
-    fact = f"instance {instance}, pid {identity.pid}, is {shown}"
-    if state == "dead":
-        return fail(
-            f"{fact}: it crashed or was killed", "start it again: it keeps the cells that are in memory"
-        )
-    if state == "stopped":
-        return fail(fact, f"continue it: kill -CONT {identity.pid}")
-    if state == "starting":
-        return warn(fact, "wait until it listens: kernels are compiled the first time")
-    if state == "hung":
-        return fail(
-            fact,
-            "if its log says that it cannot write its statistics, lift that limit; else the watchdog ends it"
-            f" under systemd, elsewhere kill -ABRT {identity.pid}",
-        )
+    it_is = f"instance {instance}, pid {identity.pid}, is"
+    if problem := state_problem(diagnosis.seen):
+        return dataclasses.replace(problem, fact=f"{it_is} {problem.fact}")
+    fact = f"{it_is} {diagnosis.seen.state}"
     if defects := diagnosis.seen.counters.get("defects", 0):
         return warn(
             f"{fact}; it survived {counted(defects, 'exception')}",

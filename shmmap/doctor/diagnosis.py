@@ -5,24 +5,21 @@ from __future__ import annotations
 
 import os
 import pwd
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Final
 
 from shmmap.daemon.config import DaemonConfig
+from shmmap.doctor.daemon_lists import ANSWER_S
 from shmmap.doctor.store_probe import StoreAnswer, StoreQuestion, ask_store
 from shmmap.errors import ShmmapError
 from shmmap.mounts import Mount, mount_of
 from shmmap.origin.remote.store import is_published, is_url
+from shmmap.protocol.rows import LiveMapRow
 from shmmap.statistics.identity import DaemonIdentity
 from shmmap.statistics.reader import Snapshot
-
-__all__ = ["ANSWER_S", "Diagnosis", "Machine", "answering_at"]
-
-ANSWER_S: Final = 2.0
-"""Seconds that a check waits for the daemon's answer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +69,16 @@ class Diagnosis:
     def identity(self) -> DaemonIdentity | None:
         """Identity of the running daemon; None if none runs."""
         return self.seen.identity if self.seen is not None and self.alive else None
+
+    @property
+    def live_names(self) -> list[str]:
+        """Names of the live maps that the running daemon keeps."""
+        return self.identity.live.split() if self.identity else []
+
+    @property
+    def live_rows(self) -> Sequence[LiveMapRow]:
+        """State of these maps; empty if the daemon does not answer."""
+        return self.seen.live if self.seen is not None and self.alive else ()
 
     @property
     def alive(self) -> bool:

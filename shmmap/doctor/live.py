@@ -13,14 +13,11 @@ from typing import Final
 from shmmap.daemon.config_live import SERVICE_STATE, live_directory
 from shmmap.daemon.prerequisites import account_name
 from shmmap.doctor.access import group_name, groups_of, is_in, paths_of_service
-from shmmap.doctor.diagnosis import ANSWER_S, Diagnosis
+from shmmap.doctor.diagnosis import Diagnosis
 from shmmap.doctor.verdicts import Finding, fail, ok, skip, warn
-from shmmap.errors import ConfigError, ShmmapError
-from shmmap.protocol.rows import LiveMapRow
+from shmmap.errors import ConfigError
 from shmmap.quantities import counted, format_bytes
 from shmmap.segment.directory import DEFAULT_SHM_DIR
-
-__all__ = ["check_live_disk", "check_live_maps", "check_live_memory"]
 
 NAMED: Final = 3
 """Problems and readers that are listed, at most."""
@@ -33,31 +30,14 @@ ROOM_BYTES: Final = 64 << 20
 _MARKS_MODE: Final = {True: 0o1770, False: 0o700}  # by whether mappers have a group
 
 
-def _rows(diagnosis: Diagnosis) -> list[LiveMapRow]:
-    return diagnosis.seen.live if diagnosis.alive and diagnosis.seen is not None else []
-
-
-def _reported(diagnosis: Diagnosis) -> tuple[LiveMapRow, ...]:
-    """Return the daemon's report on its live maps; empty if it does not answer."""
-    from shmmap.client.client import connect
-
-    if diagnosis.state != "healthy" or not _rows(diagnosis):
-        return ()
-    try:
-        with connect(
-            diagnosis.socket, timeout=ANSWER_S, connect_timeout=ANSWER_S, name="shmmap doctor"
-        ) as client:
-            return client.live_maps()
-    except ShmmapError:
-        return ()
-
-
 # --- damage --------------------------------------------------------------------------------------------
 
 
 def check_live_maps(diagnosis: Diagnosis) -> Finding:
     """Check that every chunk can be loaded and saved, and that none is lost."""
-    rows = _rows(diagnosis)
+    rows = diagnosis.live_rows
+    if not rows and diagnosis.live_names:
+        return skip(f"{', '.join(diagnosis.live_names)}: the daemon does not answer")
     if not rows:
         running = "this daemon keeps none" if diagnosis.alive else "no daemon runs"
         return skip(running if diagnosis.alive or diagnosis.config.live else "none are set up")
@@ -70,11 +50,11 @@ def check_live_maps(diagnosis: Diagnosis) -> Finding:
             "see to its files and its disk: it is tried again, and what is in memory stays there meanwhile",
         )
     if damaged := sum(row.damaged_count for row in rows):
-        texts = [f"{row.name}: {text}" for row in _reported(diagnosis) for text in row.damaged][:NAMED]
+        texts = [f"{row.name}: {text}" for row in diagnosis.live_rows for text in row.damaged][:NAMED]
         named = f" ({'; '.join(texts)}{'; …' if damaged > NAMED else ''})" if texts else ""
         return warn(
-            f"damaged files, missing chunks: {damaged:,}{named}",
-            "damaged files are in quarantine; stop the daemon, then `shmmap live fsck` says what is left",
+            f"lost chunks, damaged databases: {damaged:,}{named}",
+            "what is damaged is kept; stop the daemon, then `shmmap live fsck` says what is left",
         )
     if restarts := diagnosis.counters.get("live_restarts", 0):
         return warn(
@@ -92,7 +72,7 @@ def check_live_disk(diagnosis: Diagnosis) -> Finding:
     places = _places(diagnosis)
     if not places:
         return skip("no live map is set up")
-    facts, kept = [], {row.name for row in _rows(diagnosis)}
+    facts, kept = [], {*diagnosis.live_names, *(row.name for row in diagnosis.live_rows)}
     for which, path in places.items():
         if not path:
             return warn(f"{which}: there is no state directory", f"set path in [live.{which}]")
@@ -110,7 +90,7 @@ def check_live_disk(diagnosis: Diagnosis) -> Finding:
         if closed:
             return fail(f"{which}: {closed}", f"allow it, or set path in [live.{which}]")
         free = space.f_bavail * space.f_frsize
-        budget = max((row.budget_bytes for row in _rows(diagnosis) if row.name == which), default=0)
+        budget = max((row.budget_bytes for row in diagnosis.live_rows if row.name == which), default=0)
         facts.append(f"{which}: {path}, {format_bytes(free)} free")
         if free < max(budget, ROOM_BYTES):
             return warn(
@@ -122,7 +102,7 @@ def check_live_disk(diagnosis: Diagnosis) -> Finding:
 
 def _places(diagnosis: Diagnosis) -> dict[str, str]:
     """Return the directory of each map, from the daemon or else the settings; empty if there are none."""
-    if reported := _reported(diagnosis):
+    if reported := diagnosis.live_rows:
         return {row.name: row.path for row in reported}
     instance = diagnosis.config.instance
     environ: Mapping[str, str] = os.environ
@@ -171,7 +151,7 @@ def _not_writable(diagnosis: Diagnosis, path: str, place: str, *, read_only: boo
 
 def check_live_memory(diagnosis: Diagnosis) -> Finding:
     """Check the directory of chunks in memory, and that no reader uses many resources."""
-    rows = _rows(diagnosis)
+    rows = diagnosis.live_rows
     if not rows and not diagnosis.config.live:
         return skip("no live map is set up")
     path = _live_shm_dir(diagnosis)
@@ -208,7 +188,7 @@ def _live_shm_dir(diagnosis: Diagnosis) -> str:
 def _wrong_marks(diagnosis: Diagnosis, path: str) -> str:
     """Return what is wrong with the directory in which mappers put their scans."""
     marks = f"{path}/shmmap-live.{diagnosis.config.instance}.marks"
-    if not _rows(diagnosis):
+    if not diagnosis.live_rows:
         return ""
     try:
         status = os.stat(diagnosis.machine.path(marks), follow_symlinks=False)
@@ -260,10 +240,10 @@ def _parent(diagnosis: Diagnosis, pid: str) -> int:
 
 def _busy(diagnosis: Diagnosis) -> str:
     """Return clients whose requests about live maps take much time; empty if none."""
-    seen = diagnosis.seen.clients if diagnosis.seen is not None else []
-    clients = {client.session: client for client in seen}
+    listed = diagnosis.seen.clients if diagnosis.seen is not None else None
+    clients = {client.session: client for client in listed or ()}
     texts = []
-    for row in _reported(diagnosis):
+    for row in diagnosis.live_rows:
         for session, thousandths in row.readers:
             if thousandths >= BUSY:
                 client = clients.get(session)

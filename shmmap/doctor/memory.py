@@ -21,14 +21,6 @@ from shmmap.private_directory import why_not_private
 from shmmap.quantities import format_bytes
 from shmmap.service.huge_pages import kernel_version, of_all_sizes
 
-__all__ = [
-    "check_container",
-    "check_disk_cache",
-    "check_huge_pages",
-    "check_memory_limit",
-    "check_shared_memory",
-]
-
 CONTAINER_DEFAULT_BYTES: Final = 64 << 20  # size that Docker and Podman give /dev/shm
 
 

@@ -24,8 +24,6 @@ from shmmap.doctor.verdicts import (
 )
 from shmmap.quantities import format_duration, format_utc
 
-__all__ = ["check_clock", "check_credentials", "check_link", "check_signature", "check_versions"]
-
 MAX_OFF_S: Final = 60.0
 """Clock difference that the link's delay cannot explain; at 5 or 15 minutes stores refuse signed requests."""
 _SKEW_S: Final = 300.0

@@ -21,8 +21,6 @@ import msgspec
 
 from shmmap.errors import ConfigError, MapDataError, MapMissing, Offline, PackageMissing, ShmmapError
 
-__all__ = ["ASKED_S", "StoreAnswer", "StoreQuestion", "ask_store"]
-
 ASKED_S: Final = 12.0
 """Seconds that the process may take, including its start."""
 _CLOCK_S: Final = 3.0

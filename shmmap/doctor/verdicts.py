@@ -1,37 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Findings, and verdicts from the counters alone, in the same words for ``status``, ``top`` and ``doctor``.
+"""Findings, and verdicts from the statistics, in the same words for all screens.
 
-The verdicts: whether the cache is too small, how long the storage has been out of reach, whether the map's
-signature is valid.
+The verdicts: what is wrong, worst first; whether the cache is too small, how long the storage has been out of
+reach, whether the map's signature is valid.
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
-from shmmap.quantities import format_bytes, format_duration, format_utc
+from shmmap.installed import RESTART
+from shmmap.quantities import counted, format_bytes, format_duration, format_utc
 from shmmap.statistics.counters import REFUSALS
 
-__all__ = [
-    "Finding",
-    "State",
-    "Verdict",
-    "cache_verdict",
-    "fail",
-    "ok",
-    "outage_so_far",
-    "refused_offer",
-    "signature_expiry",
-    "signature_lines",
-    "signature_times",
-    "skip",
-    "trust_problems",
-    "valid_until",
-    "warn",
-    "worst",
-]
+if TYPE_CHECKING:
+    from shmmap.statistics.reader import Snapshot
 
 State = Literal["ok", "warn", "fail"]
 _SEVERITY: Final[dict[State, int]] = {"ok": 0, "warn": 1, "fail": 2}
@@ -76,6 +62,84 @@ def worst(findings: list[Finding]) -> State:
     """Return the most severe state among findings."""
     return max((one.state for one in findings), key=_SEVERITY.__getitem__, default="ok")
 
+
+def problems(found: Snapshot) -> list[Finding]:
+    """Return what is wrong with a daemon, worst first; empty if nothing is."""
+    counters, state = found.counters, state_problem(found)
+    known = [*([] if state is None else [state]), *troubles(found)]
+    if count := counters.get("unloadable", 0):
+        known.append(
+            fail(f"{counted(count, 'layer')} of cells cannot be loaded", "`shmmap doctor` names them")
+        )
+    cache = cache_verdict(counters)
+    if cache.too_small and not counters.get("refused_over_budget_1min", 0):
+        known.append(warn(f"the cache is TOO SMALL: {cache.why}", cache.hint))
+    if count := counters.get("defects", 0):
+        known.append(warn(f"it survived {counted(count, 'exception')}", "please report what its log says"))
+    return sorted(known, key=lambda one: -_SEVERITY[one.state])
+
+
+def state_problem(found: Snapshot) -> Finding | None:
+    """Return what keeps a daemon from answering, by its state; None if it is healthy, or does not run."""
+    pid = found.identity.pid if found.identity is not None else 0
+    silent = f"no heartbeat for {format_duration(found.beat_age_s)}"
+    return {
+        "starting": warn("starting: it does not listen yet", "wait: kernels are compiled the first time"),
+        "stopped": fail(f"PAUSED, {silent}", f"continue it: kill -CONT {pid}"),
+        "hung": fail(
+            f"HUNG, {silent}",
+            "if its log says that it cannot write its statistics, lift that limit; else the watchdog ends it"
+            f" under systemd, elsewhere kill -ABRT {pid}",
+        ),
+        "dead": fail("DEAD: it crashed or was killed", "start it again: it keeps the cells in memory"),
+    }.get(found.state)
+
+
+def troubles(found: Snapshot) -> list[Finding]:
+    """Return problems that clients have although the daemon replies."""
+    counters, live = found.counters, found.live
+    known = []
+    if count := counters.get("refused_over_budget_1min", 0):
+        known.append(
+            fail(
+                f"{counted(count, 'cell')} refused for lack of memory in the last minute",
+                "raise --budget; `shmmap clients` lists the users of memory",
+            )
+        )
+    if counters.get("origin_out", 0):
+        known.append(fail("no load succeeds: the map's files are out of reach", "`shmmap doctor`"))
+    known += [
+        fail(f"live map {row.name}: {row.problem}", "`shmmap live ls` shows whether it goes on")
+        for row in live
+        if row.problem
+    ]
+    if counters.get("last_reload_failed", 0) and not counters.get("published_refusal", 0):
+        known.append(
+            fail("the map could not be read again: its old state is served", "`shmmap reload` says why")
+        )
+    known += [warn(problem, "`shmmap doctor` says more") for problem in trust_problems(counters, time.time())]
+    known += [
+        warn(
+            f"live map {row.name}: {row.damaged_count:,} lost chunks or damaged databases"
+            + (f": {'; '.join(row.damaged[:_NAMED])}" if row.damaged else ""),
+            "`shmmap doctor` says what to do",
+        )
+        for row in live
+        if row.damaged_count
+    ]
+    if count := counters.get("map_problems", 0):
+        known.append(
+            warn(
+                f"{counted(count, 'problem')} in the map", "`shmmap reload` names them, and the daemon's log"
+            )
+        )
+    if counters.get("package_replaced", 0):
+        known.append(warn(RESTART, "it keeps what is in memory"))
+    return known
+
+
+_NAMED: Final = 3
+"""Damaged files that are named, at most."""
 
 RELOADED_SHARE: Final = 0.05
 RELOADED_COUNT: Final = 10

@@ -25,19 +25,6 @@ from shmmap.formats.point_checks import step_warning
 from shmmap.formats.source_file import open_regular, refusal
 from shmmap.formats.text_reader import TABLE_SUFFIXES, TEXT_SUFFIXES, TextReader
 
-__all__ = [
-    "CLOUD_SUFFIXES",
-    "READABLE_SUFFIXES",
-    "BlockReader",
-    "CloudDescription",
-    "PointCloud",
-    "cloud_suffix",
-    "describe",
-    "open_blocks",
-    "read_cloud",
-    "read_pcd",
-]
-
 CLOUD_SUFFIXES: Final = (".pcd", *LAS_SUFFIXES, ".ply", *TEXT_SUFFIXES)
 """File endings, in lower case, that count as clouds in a directory."""
 

@@ -19,22 +19,6 @@ if TYPE_CHECKING:  # the command line parses its options without numpy
     import numpy as np
     from numpy.typing import NDArray
 
-__all__ = [
-    "FEET",
-    "GEOGRAPHIC_SYSTEM",
-    "LENGTHS",
-    "METRE",
-    "UNITS",
-    "CoordinateSystem",
-    "LengthUnit",
-    "degrees_warning",
-    "geokey_system",
-    "unit_text",
-    "unit_warnings",
-    "units_text",
-    "wkt_system",
-]
-
 
 class LengthUnit(NamedTuple):
     """A unit of length and its length in metres; 0 if that is unknown."""

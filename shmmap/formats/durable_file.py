@@ -13,8 +13,6 @@ from typing import IO, Final
 
 from shmmap.errors import CannotWrite, ShmmapError
 
-__all__ = ["appearing_file", "flush_directory", "locked_entry", "locked_file", "writing_errors"]
-
 _LOCK_FLAGS: Final = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 _ELSEWHERE: Final = "choose a directory that this user may write to"
 _HINTS: Final = {

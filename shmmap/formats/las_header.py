@@ -19,8 +19,6 @@ from shmmap.formats.coordinate_system import CoordinateSystem, geokey_system, wk
 from shmmap.formats.laz_chunks import standard_bytes
 from shmmap.formats.source_file import open_regular, refusal
 
-__all__ = ["LasHeader", "read_las_header"]
-
 _SIGNATURE: Final = b"LASF"
 _HEADER_BYTES: Final = 375  # LAS 1.4
 _SHORTEST_BYTES: Final = 227  # LAS 1.0 to 1.2

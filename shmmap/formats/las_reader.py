@@ -27,8 +27,6 @@ from shmmap.formats.laz_chunks import check_laz
 from shmmap.formats.point_checks import LasChecks, las_left_out
 from shmmap.formats.source_file import refusal
 
-__all__ = ["LAS_SUFFIXES", "LasReader"]
-
 LAS_SUFFIXES: Final = (".las", ".laz")  # COPC files end in .copc.laz
 
 _PANICS: Final = "pyo3_runtime"  # module of exceptions that stand for panics in Rust
@@ -80,7 +78,7 @@ class LasReader:
         self.points = checked.points
         self.compressed = checked.compressed
         self.crs = checked.crs
-        laspy = _laspy(self.path)
+        laspy = _laspy(self.path, compressed=self.compressed)
         chunks = None
         backends: dict[str, Any] = {}
         with ExitStack() as undo, _refused(self.path, ""):
@@ -209,13 +207,19 @@ def _refused(path: str, when: str) -> Iterator[None]:
         raise refusal("bad_las", f"{when}laspy refuses it: {_first_line(error)}", path=path) from error
 
 
-def _laspy(path: str) -> Any:
+def _laspy(path: str, *, compressed: bool) -> Any:
+    """Import laspy, and its decompressor where the file needs it."""
+    package = "laspy"
     try:
         import laspy
+
+        if compressed:
+            package = "lazrs"
+            import lazrs  # noqa: F401
     except ImportError as error:
         raise PackageMissing(
-            f"{path}: LAS and LAZ need the Python package laspy, which cannot be loaded: {error}",
-            hint="pip install 'laspy[lazrs]', or convert the file to PCD",
+            f"{path}: LAS and LAZ need the Python package {package}, which cannot be loaded: {error}",
+            hint="pip install 'laspy[lazrs]>=2.7' 'lazrs>=0.8.1', or convert the file to PCD",
         ) from error
     return laspy
 

@@ -17,8 +17,6 @@ from typing import IO, Final
 from shmmap.errors import MapDataError
 from shmmap.formats.source_file import refusal
 
-__all__ = ["LazChunks", "check_laz", "standard_bytes"]
-
 _RECORD: Final = struct.Struct("<H10xI16xH")  # compressor, points per chunk, items
 _ITEM: Final = struct.Struct("<HHH")  # type, bytes, version
 _VARIABLE: Final = (0, 0xFFFFFFFF)  # points per chunk if the table counts them

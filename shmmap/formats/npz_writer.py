@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from shmmap.processes.interrupts import interrupts_later
 
-__all__ = ["npz_archive", "write_npz"]
-
 
 @contextlib.contextmanager
 def npz_archive(file: IO[bytes], compression: int = zipfile.ZIP_STORED) -> Iterator[zipfile.ZipFile]:

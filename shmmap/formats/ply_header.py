@@ -21,8 +21,6 @@ from shmmap.formats.pcd.fields import AXES, MAX_FIELDS, PcdField
 from shmmap.formats.source_file import refusal
 from shmmap.formats.stated_units import decoded, system_of_comments
 
-__all__ = ["HEADER_LIMIT_BYTES", "PlyElement", "PlyHeader", "PlyProperty", "parse_ply_header", "ply_header"]
-
 HEADER_LIMIT_BYTES: Final = 1 << 20
 """Maximum length of a header in bytes."""
 

@@ -25,8 +25,6 @@ from shmmap.formats.point_checks import PointChecks
 from shmmap.formats.source_file import FileReader, refusal
 from shmmap.formats.text_rows import RowParser
 
-__all__ = ["PlyReader"]
-
 _FIRST_READ_BYTES: Final = 4096  # long enough for nearly every header
 _WALK_BYTES: Final = 1 << 20
 _SHOWN_NAME: Final = 60

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from shmmap.errors import BadRequest
 
-__all__ = ["PngWriter", "png_bytes"]
-
 _COLOUR_TYPES: Final = {1: 0, 2: 4, 3: 2, 4: 6}  # channels: grey, grey and alpha, RGB, RGBA
 _PALETTE: Final = 3
 

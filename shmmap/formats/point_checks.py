@@ -14,8 +14,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["FLOAT32_REACH_M", "LasChecks", "PointChecks", "TextChecks", "las_left_out", "step_warning"]
-
 FLOAT32_REACH_M: Final = 16384.0
 """Below this, rounding to float32 moves a coordinate by less than half a millimetre."""
 

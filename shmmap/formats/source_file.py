@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 
 from shmmap.errors import MapDataError
 
-__all__ = ["CAUSES", "FileReader", "SourceFile", "open_regular", "refusal"]
-
 _Self = TypeVar("_Self", bound="FileReader")
 
 

@@ -15,17 +15,6 @@ from typing import Final, TypeAlias
 
 from shmmap.formats.coordinate_system import LENGTHS, METRE, CoordinateSystem, LengthUnit
 
-__all__ = [
-    "Coordinates",
-    "coordinates_of",
-    "decoded",
-    "named_unit",
-    "split_names",
-    "system_of_comments",
-    "units_in_comments",
-    "units_row",
-]
-
 DEGREE: Final = LengthUnit("degree", 0.0)
 _UNSTATED: Final = LengthUnit("a unit that the header does not state", 0.0)
 

@@ -21,20 +21,6 @@ from numpy.typing import NDArray
 from shmmap.formats.png import png_bytes
 from shmmap.logfmt import escaped
 
-__all__ = [
-    "INK",
-    "PALE",
-    "Axes",
-    "BoxTuple",
-    "Page",
-    "box_around",
-    "dash",
-    "element",
-    "escape",
-    "swatch",
-    "tooltip",
-]
-
 BoxTuple: TypeAlias = tuple[float, float, float, float]
 Place: TypeAlias = tuple[float, float]
 Attribute: TypeAlias = str | float | None
@@ -49,6 +35,7 @@ _SYMBOL_PX: Final = 26.0
 _ENTRY_GAP_PX: Final = 18.0
 _SCALE_BAR_PX: Final = 180.0  # maximum length
 _SCALE_PX: Final = _SCALE_BAR_PX + 90.0  # including its label and the space before it
+_TICK_PX: Final = 110.0  # pixels between coordinates, at least
 _MAX_RASTER: Final = 2400  # pixels along the longer side
 
 
@@ -99,6 +86,21 @@ def box_around(places: Sequence[Place]) -> BoxTuple:
     """Return the box around all places, at least one unit a side; at the origin if there are none."""
     x, y = zip(*places, strict=True) if places else ((0.0,), (0.0,))
     return min(x), min(y), max(*x, min(x) + 1.0), max(*y, min(y) + 1.0)
+
+
+def round_length(longest: float) -> float:
+    """Return the largest 1, 2 or 5 times a power of ten that is not longer."""
+    power = 10.0 ** math.floor(math.log10(longest))
+    return max(step * power for step in (1, 2, 5) if step * power <= longest)
+
+
+def round_steps(low: float, high: float, count: float) -> Iterator[float]:
+    """Yield multiples of 1, 2 or 5 times a power of ten from ``low`` to ``high``, at most about ``count``."""
+    span, count = max(high - low, 1e-12), max(count, 1.0)
+    power = 10.0 ** math.floor(math.log10(span / count))
+    step = next(power * factor for factor in (1, 2, 5, 10, 20) if span / (power * factor) <= count)
+    for number in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1):
+        yield round(number * step, 10)
 
 
 def _number(value: float) -> str:
@@ -212,19 +214,22 @@ class Axes:
     height: float
 
     @classmethod
-    def fitted(cls, page: Page, box: BoxTuple, top: float, max_height: float) -> Axes:
+    def fitted(cls, page: Page, box: BoxTuple, top: float, max_height: float, *, left: float = 0.0) -> Axes:
         """Return axes with one scale for x and y: as large as fits, centred on the page.
 
         Parameters
         ----------
         top, max_height
             Vertical space available, pixels; horizontally it is from margin to margin.
+        left
+            Space kept free at the left, for `coordinates`.
         """
-        max_width = page.right - page.margin
+        max_width = page.right - page.margin - left
         span_x, span_y = max(box[2] - box[0], 1e-9), max(box[3] - box[1], 1e-9)
         scale = min(max_width / span_x, max_height / span_y)
         width = span_x * scale
-        return cls(page, box, page.margin + (max_width - width) / 2, top, width, span_y * scale)
+        start = page.margin + left + (max_width - width) / 2
+        return cls(page, box, start, top, width, span_y * scale)
 
     @property
     def bottom(self) -> float:
@@ -328,6 +333,20 @@ class Axes:
         for value, text in y_labels:
             self.page.text(self.left - 7, self.place(0, value)[1] + 4, text, text_anchor="end", **small)
 
+    def coordinates(self, **attributes: Attribute) -> None:
+        """Write round values below and to the left of the rectangle, each at a short mark."""
+        min_x, min_y, max_x, max_y = self.box
+        marks = []
+        for value in round_steps(min_x, max_x, self.width / _TICK_PX):
+            x, _ = self.place(value, min_y)
+            marks.append(f"M{_number(x)} {_number(self.bottom)}v5")
+            self.page.text(x, self.bottom + 19, f"{value:.10g}", text_anchor="middle", **attributes)
+        for value in round_steps(min_y, max_y, self.height / _TICK_PX):
+            _, y = self.place(min_x, value)
+            marks.append(f"M{_number(self.left)} {_number(y)}h-5")
+            self.page.text(self.left - 9, y + 4, f"{value:.10g}", text_anchor="end", **attributes)
+        self.page.add("path", d="".join(marks), stroke=PALE)
+
     def scale_bar(self, y: float) -> None:
         """Draw a scale bar of 1, 2 or 5 times a power of ten metres at the right, its label to the left.
 
@@ -337,9 +356,7 @@ class Axes:
             Baseline of the label.
         """
         right = self.page.right
-        longest = _SCALE_BAR_PX / self.scale
-        power = 10.0 ** math.floor(math.log10(longest))
-        metres = max(step * power for step in (1, 2, 5) if step * power <= longest)
+        metres = round_length(_SCALE_BAR_PX / self.scale)
         length = metres * self.scale
         bar = f"M{_number(right - length)} {_number(y - 10)}v7h{_number(length)}v-7"
         self.page.add("path", d=bar, fill="none", stroke=INK, stroke_width=1.6)

@@ -34,8 +34,6 @@ from shmmap.formats.stated_units import (
 )
 from shmmap.formats.text_rows import NUMBER, RowParser, line_ends, whole_lines
 
-__all__ = ["TABLE_SUFFIXES", "TEXT_SUFFIXES", "TextReader"]
-
 TEXT_SUFFIXES: Final = (".pts", ".xyz", ".xyzn", ".xyzrgb")
 TABLE_SUFFIXES: Final = (".txt", ".csv", ".asc")
 """Endings that are read if the file is named; in a directory such files may be anything."""

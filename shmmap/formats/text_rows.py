@@ -20,8 +20,6 @@ from shmmap.errors import MapDataError
 from shmmap.formats.pcd.fields import FieldTable
 from shmmap.formats.source_file import SourceFile, refusal
 
-__all__ = ["NUMBER", "RowParser", "line_ends", "whole_lines"]
-
 _CHUNK_BYTES: Final = 1 << 18
 _LINE_LIMIT_BYTES: Final = 1 << 20
 NUMBER: Final = re.compile(

@@ -19,8 +19,6 @@ from shmmap.formats.durable_file import appearing_file, writing_errors
 from shmmap.layers.build import build_layer
 from shmmap.layers.spec import kinds
 
-__all__ = ["main"]
-
 
 def main(arguments: list[str] | None = None) -> int:
     """Build the layer, write it, and return the exit code."""

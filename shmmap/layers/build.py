@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -23,7 +24,7 @@ import numpy as np
 import xxhash
 from numpy.typing import NDArray
 
-from shmmap.errors import BadRequest, InternalError, MapDataError
+from shmmap.errors import BadRequest, CannotWrite, InternalError, MapDataError
 from shmmap.formats.source_file import refusal
 from shmmap.kernel_cache import all_kept, compiled_mark
 from shmmap.layers.contract import BUILT_ANYWHERE, Box, Columns, LayerTable, PointTable
@@ -35,19 +36,6 @@ from shmmap.logfmt import log
 from shmmap.segment.layout import NO_SOURCE, SegmentHeader, SourceStamp
 from shmmap.segment.version import Source
 from shmmap.segment.writer import SegmentOrigin, write_table
-
-__all__ = [
-    "Halo",
-    "Made",
-    "build_layer",
-    "build_spec",
-    "cache_key",
-    "combined_digest",
-    "compile_kernels",
-    "derive",
-    "make_layer",
-    "read_halo",
-]
 
 
 def build_layer(
@@ -339,6 +327,42 @@ def make_layer(
             cache.writable = False
             log.warning("layers not kept on disk", cache_dir=cache.directory, error=error)
     return made
+
+
+def keep_layer(
+    spec: LayerSpec,
+    job: CellJob,
+    cache: LayerCache,
+    *,
+    source: Callable[[], CellSource | None] | None = None,
+) -> int:
+    """Compute a layer into the cache, without a segment; return its bytes.
+
+    Parameters
+    ----------
+    source
+        As in `make_layer`.
+
+    Raises
+    ------
+    MapDataError
+        As in `make_layer`.
+    CannotWrite
+        The cache has no room for it, or cannot be written.
+    """
+    fd = os.memfd_create("layer", os.MFD_CLOEXEC)
+    try:
+        made = make_layer(spec, job, fd, source=source)
+        key = CacheKey(spec, job, made.header.source, made.neighbours)
+        try:
+            stored = cache.store(key, made.header, fd)
+        except OSError as error:
+            raise CannotWrite(f"{cache.directory}: {error.strerror or error}") from error
+        if not stored:
+            raise CannotWrite(f"{cache.directory}: there is no room for it")
+        return made.header.total_bytes
+    finally:
+        os.close(fd)
 
 
 def compile_kernels(*, wait: bool = True) -> None:

@@ -21,6 +21,7 @@ from shmmap.segment.layout import Lattice
 
 __all__ = [
     "BUILT_ANYWHERE",
+    "OTHER_FIELDS",
     "Box",
     "Columns",
     "Lattice",
@@ -114,6 +115,13 @@ class LayerColumn:
         Dtype; None: that of the source's column of the same name.
     shape
         Text for documentation, such as ``(rows, 3)``.
+    unit, meaning
+        SI unit, empty for none; what a value is.
+    frame
+        ``map`` where values are coordinates in the map frame, relative to `Cell.origin`; empty where no frame
+        matters.
+    missing
+        What stands where there is no value, such as ``NaN``; empty if every row has a value.
     """
 
     name: str
@@ -121,6 +129,19 @@ class LayerColumn:
     shape: str
     unit: str
     meaning: str
+    frame: str = ""
+    missing: str = ""
+
+
+OTHER_FIELDS: Final = LayerColumn(
+    "*",
+    None,
+    "the source's",
+    "the source's",
+    "every other field: intensity, ring, ...",
+    missing="the source's",
+)
+"""The other columns of a kind that keeps those of its source."""
 
 
 @dataclass(slots=True)
@@ -185,6 +206,9 @@ class LayerTable:
     rows: int
     units: Mapping[str, str] = field(default_factory=dict)
     lattice: Lattice | None = None
+
+    def __repr__(self) -> str:
+        return f"<LayerTable of {self.rows} rows: {', '.join(self.columns)}>"
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         return self.columns[name]

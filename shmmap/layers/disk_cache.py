@@ -37,9 +37,6 @@ from shmmap.segment.header import checked_blocks, pack_header, read_page, unpack
 from shmmap.segment.layout import LAYOUT_VERSION, SegmentHeader, SourceStamp, header_size
 from shmmap.segment.writer import write_all
 
-__all__ = ["CacheKey", "LayerCache"]
-
-
 _CONTENT: Final = "content"
 _MODE: Final = 0o755  # other accounts may read what root has prepared
 _BLOCK_BYTES: Final = 1 << 18  # a block stays in the L2 cache while it is hashed and written

@@ -51,19 +51,6 @@ from shmmap.layers.contract import (
 )
 from shmmap.layers.voxels import edge, group_points
 
-__all__ = [
-    "ELEVATION",
-    "GROUND",
-    "SEARCH",
-    "TILE_COLUMNS",
-    "GroundRule",
-    "build_elevation",
-    "build_ground",
-    "build_search",
-    "ground_height",
-]
-
-
 GroundRule = Literal["median", "min"]
 
 # distance beyond the nearest column within which other columns count, metres; for min as in the height fitter
@@ -113,10 +100,10 @@ ELEVATION: Final = LayerKind(
     ),
     parameters=(edge("resolution", "edge of a column", required=True),),
     columns=(
-        LayerColumn("min", np.dtype("<f4"), "(ny, nx)", "m", "lowest z, map frame; NaN: no points"),
-        LayerColumn("max", np.dtype("<f4"), "(ny, nx)", "m", "highest z"),
-        LayerColumn("mean", np.dtype("<f4"), "(ny, nx)", "m", "mean z"),
-        LayerColumn("count", np.dtype("<u4"), "(ny, nx)", "", "points; 0: none"),
+        LayerColumn("min", np.dtype("<f4"), "(ny, nx)", "m", "lowest z", "map", "NaN"),
+        LayerColumn("max", np.dtype("<f4"), "(ny, nx)", "m", "highest z", "map", "NaN"),
+        LayerColumn("mean", np.dtype("<f4"), "(ny, nx)", "m", "mean z", "map", "NaN"),
+        LayerColumn("count", np.dtype("<u4"), "(ny, nx)", "", "number of points", missing="0"),
     ),
     build=build_elevation,
     bytes_ratio=0.1,
@@ -213,7 +200,7 @@ GROUND: Final = LayerKind(
     summary="lowest height of each column of a ground grid, for fitting a pose's height",
     borders="as elevation: the lower of both cells' columns is that of the whole",
     parameters=(edge("resolution", "edge of a column", default=0.5),),
-    columns=(LayerColumn("min", np.dtype("<f4"), "(ny, nx)", "m", "lowest z, map frame; NaN: no points"),),
+    columns=(LayerColumn("min", np.dtype("<f4"), "(ny, nx)", "m", "lowest z", "map", "NaN"),),
     build=build_ground,
     bytes_ratio=0.05,
 )
@@ -289,8 +276,8 @@ SEARCH: Final = LayerKind(
     borders="holds the cell's own points alone; a search near a border looks into both cells",
     parameters=(edge("leaf", "edge of a column, best the distance searched", required=True),),
     columns=(
-        LayerColumn("xyz", None, "(rows, 3)", "m", "the points, map frame: by tile, column, then z"),
-        LayerColumn("tile", np.dtype("<i4"), "(tiles_y, tiles_x)", "", "number of a tile; -1: no points"),
+        LayerColumn("xyz", None, "(rows, 3)", "m", "the points: by tile, column, then z", "map"),
+        LayerColumn("tile", np.dtype("<i4"), "(tiles_y, tiles_x)", "", "number of a tile", missing="-1"),
         LayerColumn("start", np.dtype("<i4"), "(tiles * 64 + 1,)", "", "first row of each column of a tile"),
     ),
     build=build_search,

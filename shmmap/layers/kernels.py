@@ -16,9 +16,6 @@ from numba import float32, float64, int32, int64, types
 
 from shmmap.compiling import compiled, inlined, read_only
 
-__all__ = ["bounds", "count_points", "heights", "inverse_covariances", "moments", "number_voxels"]
-
-
 _POINTS: Final = tuple((read_only(real, 2), real) for real in (float32, float64))
 """Numba types of a point array, and of one coordinate."""
 _INDICES: Final = read_only(int32, 1)

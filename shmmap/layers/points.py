@@ -12,11 +12,16 @@ from numpy.typing import NDArray
 
 from shmmap.formats.pcd.reader import Block, PcdReader
 from shmmap.formats.source_file import refusal
-from shmmap.layers.contract import LayerColumn, LayerKind, LayerTable, Parameters, PointTable
+from shmmap.layers.contract import (
+    OTHER_FIELDS,
+    LayerColumn,
+    LayerKind,
+    LayerTable,
+    Parameters,
+    PointTable,
+)
 from shmmap.segment.layout import SegmentHeader, SourceStamp
 from shmmap.segment.writer import SegmentWriter
-
-__all__ = ["BUILDER_VERSION", "LAYER", "POINTS", "OutsideBox", "build_points"]
 
 LAYER: Final = "points"
 BUILDER_VERSION: Final = 1  # increase it when the same source would give other bytes
@@ -130,8 +135,8 @@ POINTS: Final = LayerKind(
     borders="each point is in the cell whose file has it",
     parameters=(),
     columns=(
-        LayerColumn("xyz", None, "(rows, 3)", "m", "coordinates, map frame"),
-        LayerColumn("*", None, "as in the source", "", "every other field"),
+        LayerColumn("xyz", None, "(rows, 3)", "m", "coordinates", "map"),
+        OTHER_FIELDS,
     ),
     build=_from_arrays,
     gives_points=True,

@@ -15,23 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.errors import BadRequest
-from shmmap.layers.contract import LayerColumn, LayerKind, LayerTable, Parameter, Parameters, PointTable
+from shmmap.layers.contract import (
+    OTHER_FIELDS,
+    LayerColumn,
+    LayerKind,
+    LayerTable,
+    Parameter,
+    Parameters,
+    PointTable,
+)
 from shmmap.open3d_loading import load_open3d
 
-__all__ = [
-    "CROP",
-    "DENOISE",
-    "NORMALS",
-    "SAMPLE",
-    "build_crop",
-    "build_denoise",
-    "build_normals",
-    "build_sample",
-]
-
-
-_XYZ: Final = LayerColumn("xyz", None, "(rows, 3)", "m", "coordinates, map frame, in the source's order")
-_SOURCE_COLUMNS: Final = (_XYZ, LayerColumn("*", None, "as in the source", "", "every other field"))
+_XYZ: Final = LayerColumn("xyz", None, "(rows, 3)", "m", "coordinates, in the source's order", "map")
+_SOURCE_COLUMNS: Final = (_XYZ, OTHER_FIELDS)
 _QUERIES_PER_BATCH: Final = 1 << 16
 
 
@@ -229,8 +225,8 @@ NORMALS: Final = LayerKind(
     ),
     columns=(
         _XYZ,
-        LayerColumn("*", None, "as in the source", "", "every other field but one called normal"),
-        LayerColumn("normal", np.dtype("<f4"), "(rows, 3)", "", "unit vector, z >= 0"),
+        OTHER_FIELDS,
+        LayerColumn("normal", np.dtype("<f4"), "(rows, 3)", "", "unit vector, z >= 0", "map"),
     ),
     build=build_normals,
     halo_m=lambda parameters: float(parameters["radius"]),

@@ -2,7 +2,8 @@
 """A cell's points as builders need them, and their readers in loaders and preparing processes.
 
 Points are read from the cell's file, from its ``points`` segment in memory, or by any other `SourceReader`,
-such as that of a published map.
+such as that of a published map.  A reader that fetches gets several jobs at once and reports which one it
+works on; the deadline of a job counts from that report.
 """
 
 from __future__ import annotations
@@ -25,21 +26,6 @@ from shmmap.quantities import format_bytes
 from shmmap.segment.header import read_header
 from shmmap.segment.layout import SegmentHeader, SourceStamp
 from shmmap.segment.version import Source, Stamp, cell_version, layer_version
-
-__all__ = [
-    "FILES",
-    "MAX_SOURCE_BYTES",
-    "CellJob",
-    "CellSource",
-    "Fetcher",
-    "Files",
-    "Neighbour",
-    "SourceReader",
-    "check_size",
-    "read_segment",
-    "read_source",
-]
-
 
 MAX_SOURCE_BYTES: Final = 1 << 30
 """Size limit of one cell's uncompressed points, as a layer's builder holds all of them in memory.

@@ -34,19 +34,6 @@ from shmmap.layers.selections import CROP, DENOISE, NORMALS, SAMPLE
 from shmmap.layers.voxels import NDT, VOXEL
 from shmmap.logfmt import log
 
-__all__ = [
-    "MAX_SPEC_CHARACTERS",
-    "LayerSpec",
-    "canonical_layer",
-    "canonical_layers",
-    "find_kind",
-    "kinds",
-    "layer_spec",
-    "parse_layer",
-    "register",
-]
-
-
 GROUP: Final = "shmmap.layers"
 
 _own: Final[dict[str, LayerKind]] = {

@@ -22,8 +22,6 @@ from shmmap.layers.points import LAYER
 from shmmap.layers.spec import layer_spec
 from shmmap.segment.version import layer_version
 
-__all__ = ["MAX_NEIGHBOURS", "Cells", "LayerVersions"]
-
 MAX_NEIGHBOURS: Final = 64
 """Maximum number of neighbouring files that a layer with a halo reads."""
 MAX_REMEMBERED: Final = 1 << 18

@@ -22,20 +22,6 @@ from shmmap.layers.contract import LayerColumn, LayerKind, LayerTable, Parameter
 from shmmap.lazy_imports import needed_packages
 from shmmap.segment.layout import Lattice
 
-__all__ = [
-    "CONVENTIONS",
-    "MAX_TABLE_VOXELS",
-    "NDT",
-    "VOXEL",
-    "Convention",
-    "Grouping",
-    "build_ndt",
-    "build_voxel",
-    "edge",
-    "group_points",
-    "voxel_covariances",
-]
-
 MAX_TABLE_VOXELS: Final = 1 << 24
 """Maximum number of voxels of a stored dense table: 64 MiB of int32, a 512 m cube at 2 m."""
 
@@ -277,8 +263,15 @@ VOXEL: Final = LayerKind(
         edge("leaf_z", "edge along z"),
     ),
     columns=(
-        LayerColumn("xyz", None, "(rows, 3)", "m", "mean of the points, map frame"),
-        LayerColumn("*", None, "(rows,)", "", "mean of the column; float32 or float64 where it has integers"),
+        LayerColumn("xyz", None, "(rows, 3)", "m", "mean of the points", "map"),
+        LayerColumn(
+            "*",
+            None,
+            "the source's",
+            "the source's",
+            "mean of the field; of integers float32 up to 16 bits, else float64",
+            missing="not finite if one is not",
+        ),
         LayerColumn("count", np.dtype("<u4"), "(rows,)", "", "points of the voxel"),
     ),
     build=build_voxel,
@@ -399,13 +392,14 @@ NDT: Final = LayerKind(
         Parameter("min_points", int, "minimum points of a voxel", default=6, minimum=2, maximum=1 << 30),
     ),
     columns=(
-        LayerColumn("mean", np.dtype("<f8"), "(rows, 3)", "m", "mean of the points, map frame"),
+        LayerColumn("mean", np.dtype("<f8"), "(rows, 3)", "m", "mean of the points", "map"),
         LayerColumn(
             "inverse_covariance",
             np.dtype("<f8"),
             "(rows, 6)",
             "1/m^2",
             "xx, xy, xz, yy, yz, zz of the inverse of (S + I)/(n - 1), regularised",
+            "map",
         ),
         LayerColumn(
             "scatter",
@@ -413,10 +407,11 @@ NDT: Final = LayerKind(
             "(rows, 6)",
             "m^2",
             "S: sums xx, xy, xz, yy, yz, zz of products of differences to the mean",
+            "map",
         ),
         LayerColumn("count", np.dtype("<u4"), "(rows,)", "", "n: points of the voxel"),
         LayerColumn(
-            "table", np.dtype("<i4"), "(nz, ny, nx)", "", "row of each voxel of the lattice box, -1: none"
+            "table", np.dtype("<i4"), "(nz, ny, nx)", "", "row of each voxel of the lattice box", missing="-1"
         ),
     ),
     build=build_ndt,

@@ -22,8 +22,6 @@ from shmmap.origin.spatial_index import MadeOfBoxes, SpatialIndex
 from shmmap.segment.layout import SourceStamp
 from shmmap.segment.version import Source, Stamp, cell_version
 
-__all__ = ["Catalogue", "CatalogueChange", "CellIds", "MapOrigin", "NoMap", "compare"]
-
 Indices = NDArray[np.intp]
 
 # Stamps are hashed in blocks of this many cells, so that one changed stamp costs one block.

@@ -49,17 +49,6 @@ from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.spatial_index import Grid, GridFrame, MadeOfBoxes
 from shmmap.private_directory import why_not_own
 
-__all__ = [
-    "Header",
-    "Source",
-    "default_cache_directory",
-    "load_sidecar",
-    "read_catalogue",
-    "save_sidecar",
-    "sidecar_file",
-    "write_catalogue",
-]
-
 _MAGIC: Final = b"SHMMAPCT"
 _VERSION: Final = 2
 _START: Final = struct.Struct("<8sIIQ")

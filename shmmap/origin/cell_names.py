@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 
 from shmmap.errors import BadRequest
 
-__all__ = ["CellNames", "base_names", "common_directory", "order_by_base"]
-
 Names = NDArray[np.bytes_]
 
 # Number of cached lookups; differential requests repeat the same few hundred ids.

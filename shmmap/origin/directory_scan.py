@@ -18,8 +18,6 @@ from shmmap.origin.map_layout import is_pcd
 from shmmap.origin.metadata import list_some
 from shmmap.segment.process_limits import raise_limit_behind
 
-__all__ = ["ScannedFiles", "scan"]
-
 _BLOCK_FILES = 1 << 15
 
 

@@ -48,8 +48,6 @@ from shmmap.origin.metadata import (
 from shmmap.origin.reading_apart import read_apart
 from shmmap.segment.layout import SourceStamp
 
-__all__ = ["MAX_SINGLE_PCD_BYTES", "MapDirectory", "is_served_whole", "load_single_pcd", "open_map"]
-
 # Smaller maps are scanned in a few milliseconds, so a cached catalogue would only be older, not quicker.
 _CACHED_FROM_CELLS = 2000
 

@@ -30,17 +30,6 @@ from typing import Final
 from shmmap.errors import MapDataError, MapMissing
 from shmmap.segment.process_limits import raise_limit_behind
 
-__all__ = [
-    "KUBERNETES_LINK",
-    "MapLayout",
-    "OpenedDirectories",
-    "absolute_path",
-    "divided_beside",
-    "find_layout",
-    "is_pcd",
-    "yaml_files",
-]
-
 KUBERNETES_LINK: Final = "..data"
 """In a Kubernetes volume, every visible name is a link through this link, which is switched atomically."""
 

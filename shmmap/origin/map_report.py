@@ -20,19 +20,6 @@ from numpy.typing import NDArray
 
 from shmmap.errors import MapDataError
 
-__all__ = [
-    "LINK_NAME",
-    "REPORT_HEAD",
-    "REPORT_NAME",
-    "UNKNOWN_FRAME",
-    "DividedMap",
-    "MapFrame",
-    "far_cells_notes",
-    "read_map_frame",
-    "read_report",
-    "write_report",
-]
-
 REPORT_NAME: Final = "shmmap_divide.json"
 REPORT_HEAD: Final = {"format": "shmmap divided map", "version": 1}
 _MAX_BYTES: Final = 64 << 20  # the report lists every input file

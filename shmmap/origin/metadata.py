@@ -33,20 +33,6 @@ from numpy.typing import NDArray
 from shmmap.errors import MapDataError, MapMissing
 from shmmap.segment.process_limits import raise_limit_behind
 
-__all__ = [
-    "MAX_METADATA_BYTES",
-    "MAX_NAME_BYTES",
-    "METADATA_NAME",
-    "TOO_LARGE",
-    "EntryCollector",
-    "MapMetadata",
-    "collect_lines",
-    "metadata_bytes",
-    "metadata_text",
-    "parse_metadata",
-    "shortened",
-]
-
 # yaml-cpp reads integers as C++ streams do: a leading 0x is hexadecimal, a leading 0 octal
 _INTEGER = re.compile(r"[-+]?(?:0[xX][0-9a-fA-F]+|0[0-7]*|[1-9][0-9]*)")
 _FLOAT = re.compile(r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")

@@ -22,8 +22,6 @@ from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.catalogue_bytes import read_catalogue
 from shmmap.processes.start_child import how_ended
 
-__all__ = ["Outcome", "ended_early", "not_started", "read_apart"]
-
 _PIPE_BYTES: Final = 1 << 20
 """The largest pipe that every user may have; a larger pipe needs fewer reads."""
 

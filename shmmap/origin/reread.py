@@ -24,8 +24,6 @@ from shmmap.origin.metadata import MAX_METADATA_BYTES
 from shmmap.origin.reading_apart import Outcome
 from shmmap.processes.end_with_parent import die_with
 
-__all__ = ["main"]
-
 _NICENESS: Final = 10  # the daemon's clients have priority
 _MAX_BYTES: Final = 8 << 30
 _MAX_CPU_S: Final = 600

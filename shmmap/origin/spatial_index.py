@@ -25,8 +25,6 @@ from numpy.typing import NDArray
 
 from shmmap.geometry import Area, Circle
 
-__all__ = ["Grid", "GridFrame", "MadeOfBoxes", "SpatialIndex", "touches"]
-
 Indices = NDArray[np.intp]
 Floats = NDArray[np.float64]
 Bounds = tuple[float, float, float, float]

@@ -18,8 +18,6 @@ from shmmap.origin.catalogue import Catalogue
 from shmmap.prepare.task_pool import CellDone, CellTask, TaskPool, decode_done
 from shmmap.progress import Progress
 
-__all__ = ["Failure", "Prepared", "prepare_map", "task_of"]
-
 
 @dataclass(frozen=True, slots=True)
 class Failure:

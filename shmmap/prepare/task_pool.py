@@ -23,18 +23,6 @@ from shmmap.layers.sources import Neighbour
 from shmmap.processes.start_child import MAX_PACKET_BYTES, how_ended, start_child
 from shmmap.segment.version import Source
 
-__all__ = [
-    "CellDone",
-    "CellTask",
-    "FromWorker",
-    "LayerDone",
-    "Ready",
-    "TaskPool",
-    "decode_done",
-    "decode_task",
-    "encode",
-]
-
 
 class CellTask(msgspec.Struct, array_like=True, tag="cell"):
     """Task to make layers of a cell; ``around`` lists, for each layer, the neighbours it uses."""

@@ -14,7 +14,7 @@ from typing import Final
 import xxhash
 
 from shmmap.errors import ShmmapError
-from shmmap.layers.build import cache_key, combined_digest, make_layer
+from shmmap.layers.build import cache_key, combined_digest, keep_layer
 from shmmap.layers.contract import Box
 from shmmap.layers.disk_cache import CacheKey, LayerCache
 from shmmap.layers.points import LAYER
@@ -24,8 +24,6 @@ from shmmap.prepare.task_pool import CellDone, CellTask, LayerDone, Ready, decod
 from shmmap.processes.request_threads import leave
 from shmmap.processes.start_child import MAX_PACKET_BYTES, channel_to_parent
 from shmmap.segment.version import Source
-
-__all__ = ["CellPoints", "main"]
 
 _NICENESS: Final = 5
 _BLOCK_BYTES: Final = 1 << 20
@@ -90,15 +88,7 @@ class CellPoints:
 def _build(spec: LayerSpec, job: CellJob, cache: LayerCache, source: CellPoints) -> LayerDone:
     name = str(spec)
     try:
-        fd = os.memfd_create("layer", os.MFD_CLOEXEC)
-        try:
-            made = make_layer(spec, job, fd, source=lambda: source.points(spec))
-            key = CacheKey(spec, job, made.header.source, made.neighbours)
-            if not cache.store(key, made.header, fd):
-                return LayerDone(name, "failed", 0, f"{cache.directory}: there is no room for it")
-            return LayerDone(name, "built", made.header.total_bytes)
-        finally:
-            os.close(fd)
+        return LayerDone(name, "built", keep_layer(spec, job, cache, source=lambda: source.points(spec)))
     except ShmmapError as error:
         message = str(error)
     except OSError as error:

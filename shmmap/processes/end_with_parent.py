@@ -13,8 +13,6 @@ import signal
 import sys
 from typing import Final
 
-__all__ = ["die_with", "with_us"]
-
 _PR_SET_PDEATHSIG: Final = 1
 
 

@@ -12,8 +12,6 @@ from collections.abc import Callable, Iterator, Mapping
 from types import FrameType
 from typing import Final
 
-__all__ = ["ENDINGS", "interrupts_later", "scratch_directory", "signals_interrupt"]
-
 ENDINGS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Signals by which users and the system end a program."""
 

@@ -10,8 +10,6 @@ from concurrent.futures import ThreadPoolExecutor
 from types import TracebackType
 from typing import Final, NoReturn
 
-__all__ = ["PREFIX", "RequestThreads", "leave"]
-
 PREFIX: Final = "request-"
 """How the names of threads begin that make requests, or wait for them."""
 

@@ -23,18 +23,6 @@ from typing import Final, NoReturn
 from shmmap import installed
 from shmmap.processes.end_with_parent import die_with
 
-__all__ = [
-    "MAX_PACKET_BYTES",
-    "ForkedProcess",
-    "channel",
-    "channel_to_parent",
-    "fork_child",
-    "how_ended",
-    "packet_buffer",
-    "receive_packet",
-    "start_child",
-]
-
 MAX_PACKET_BYTES: Final = 1 << 19
 """Largest packet: a job may name its cell and 65 neighbours by paths of 4095 bytes each."""
 

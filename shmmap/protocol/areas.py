@@ -10,21 +10,6 @@ import msgspec
 import shmmap.geometry as geometry
 from shmmap.errors import BadRequest
 
-__all__ = [
-    "FURTHEST_M",
-    "AreaMessage",
-    "BoxMessage",
-    "CircleMessage",
-    "HeldCell",
-    "Intent",
-    "LiveArea",
-    "Message",
-    "SphereMessage",
-    "SquareMessage",
-    "area_from_message",
-    "area_to_message",
-]
-
 FURTHEST_M: Final = 1e150
 """Bound of a sphere's centre and radius, metres, so that their squares stay finite."""
 MAX_VERTICES: Final = 4096

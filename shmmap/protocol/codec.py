@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import struct
+import threading
 from collections.abc import Iterable, Iterator, Sequence
 from functools import cache
 from typing import Final
@@ -12,21 +13,6 @@ import msgspec
 
 from shmmap.errors import BadRequest, ProtocolMismatch
 from shmmap.protocol.messages import Handle, Reply, Request
-
-__all__ = [
-    "MAX_REQUEST_BYTES",
-    "PackedArray",
-    "check_packed",
-    "decode_reply",
-    "decode_request",
-    "encode",
-    "encode_cells",
-    "encode_handle",
-    "encode_request",
-    "pack_versions",
-    "request_number",
-    "unpack_versions",
-]
 
 MAX_REQUEST_BYTES: Final = 4 << 20
 """Largest request; the socket itself refuses larger ones.  10^5 packed held cells need 800 kB."""
@@ -60,9 +46,14 @@ def _requests() -> msgspec.msgpack.Decoder[Request]:
     return msgspec.msgpack.Decoder(Request)
 
 
+_making: Final = threading.Lock()
+"""Taken to make the decoder of replies: threads that connect at once decode their first ones at once."""
+
+
 @cache
 def _replies() -> msgspec.msgpack.Decoder[Reply]:
-    return msgspec.msgpack.Decoder(Reply)
+    with _making:
+        return msgspec.msgpack.Decoder(Reply)
 
 
 def encode_handle(handle: Handle) -> bytes:

@@ -10,17 +10,6 @@ from typing import Final
 from shmmap.errors import BadRequest
 from shmmap.private_directory import CLOSED, NotPrivate, require_private
 
-__all__ = [
-    "DEFAULT_INSTANCE",
-    "EVENTS_LONGER",
-    "SYSTEM_RUNTIME_DIR",
-    "endpoint_path",
-    "fallback_runtime_dir",
-    "runtime_dirs",
-    "socket_path",
-    "why_not_used",
-]
-
 DEFAULT_INSTANCE: Final = "default"
 SYSTEM_RUNTIME_DIR: Final = "/run/shmmap"
 EVENTS_LONGER: Final = len(".events")

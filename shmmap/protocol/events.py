@@ -15,33 +15,6 @@ import msgspec
 
 from shmmap.errors import ProtocolMismatch
 
-__all__ = [
-    "UNNUMBERED",
-    "Beat",
-    "Changed",
-    "Epoch",
-    "Event",
-    "EventPage",
-    "Evicted",
-    "Failed",
-    "Joined",
-    "Left",
-    "LiveChanged",
-    "LiveDamaged",
-    "LiveEnded",
-    "LiveProblem",
-    "LiveStarted",
-    "Loaded",
-    "LongTurn",
-    "PrefetchMiss",
-    "Pressure",
-    "Recent",
-    "Reloaded",
-    "Retried",
-    "decode_event",
-    "encode_event",
-]
-
 
 class _Numbered(msgspec.Struct, array_like=True, frozen=True):
     """Fields of every event: its number in its epoch, its epoch, and the wall-clock time."""
@@ -209,7 +182,7 @@ class LiveProblem(_Numbered, tag="live_problem", frozen=True):
 
 
 class LiveDamaged(_Numbered, tag="live_damaged", frozen=True):
-    """A damaged file of a live map was quarantined, or a chunk is missing; with its name and the reason."""
+    """A chunk of a live map is lost, or its database was damaged; with its name and the reason."""
 
     map: str
     what: str

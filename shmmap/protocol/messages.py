@@ -34,8 +34,10 @@ __all__ = [
     "AreaMessage",
     "BoxMessage",
     "Bye",
+    "Cancel",
     "CellRow",
     "Cells",
+    "CellsPage",
     "CircleMessage",
     "ClientRow",
     "Differential",
@@ -48,6 +50,7 @@ __all__ = [
     "Hello",
     "Holder",
     "Intent",
+    "ListCells",
     "Metadata",
     "MetadataPage",
     "MetadataRow",
@@ -76,7 +79,7 @@ __all__ = [
     "area_to_message",
 ]
 
-PROTOCOL_VERSION: Final = (2, 0)
+PROTOCOL_VERSION: Final = (2, 2)
 
 MAX_NAMES: Final = 20_000
 """Most cells that a request may name one by one."""
@@ -142,12 +145,18 @@ class Differential(Message, tag="differential"):
 
 
 class Selected(Message, tag="selected"):
-    """Request cells by id; the reply keeps order and duplicates."""
+    """Request cells by id; the reply keeps order and duplicates.
+
+    A ``spare`` request (since 2.1) must cost other clients nothing: one of its loads begins at a time, while
+    no other load waits and memory is free.  Its cells are evicted first, unless another request asks for
+    them.  ``pending`` then promises no load.
+    """
 
     ids: Ids
     layers: Layers = ("points",)
     wait: float | None = None
     intent: Intent | None = None
+    spare: bool = False
 
 
 class Release(Message, tag="release"):
@@ -158,6 +167,12 @@ class Release(Message, tag="release"):
 
 class Stats(Message, tag="stats"):
     """Request counters, sessions, and the use of the budget."""
+
+
+class ListCells(Message, tag="list_cells"):
+    """Request a page of the segments in memory (since 2.2); ``start`` is the last page's ``next``."""
+
+    start: int = 0
 
 
 class Show(Message, tag="show"):
@@ -193,6 +208,10 @@ class Shutdown(Message, tag="shutdown"):
     """End the daemon and free its memory, as SIGTERM does (privileged)."""
 
 
+class Cancel(Message, tag="cancel"):
+    """End the wait of the session's request with this id; neither that nor this is answered.  Since 2.1."""
+
+
 class Bye(Message, tag="bye"):
     """End the session; there is no reply.  Segments that the client still maps stay in use."""
 
@@ -205,6 +224,7 @@ Request: TypeAlias = (
     | Selected
     | Release
     | Stats
+    | ListCells
     | Show
     | Reload
     | Evict
@@ -213,6 +233,7 @@ Request: TypeAlias = (
     | Shutdown
     | Recent
     | LiveRequest
+    | Cancel
     | Bye
 )
 
@@ -357,6 +378,23 @@ class StatsReply(Message, tag="stats_reply"):
     unknown_holders: int = 0
     unknown_bytes: int = 0
 
+    def __repr__(self) -> str:
+        return (
+            f"<StatsReply of daemon run {self.epoch:016x}: {len(self.counters)} counters,"
+            f" {len(self.sessions)} sessions>"
+        )
+
+
+class CellsPage(Message, tag="cells_page"):
+    """Answer to `ListCells`; ``next`` is nil on the last page.
+
+    A segment that stays in memory is on at least one page.
+    """
+
+    epoch: int
+    rows: tuple[CellRow, ...]
+    next: int | None = None
+
 
 class ShownCell(Message, tag="shown_cell"):
     """Answer to `Show`; ``id`` is complete, ``failure`` is the last failure if it still applies.
@@ -435,6 +473,7 @@ Reply: TypeAlias = (
     | MetadataPage
     | Released
     | StatsReply
+    | CellsPage
     | ShownCell
     | Reloaded
     | Evicted

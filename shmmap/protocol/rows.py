@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rows about segments, clients and live maps, used in replies and in the statistics segment."""
+"""Rows about segments, clients and live maps in replies."""
 
 from __future__ import annotations
 
 from typing import Literal, TypeAlias
 
 import msgspec
-
-__all__ = ["CellRow", "CellState", "ClientRow", "Holder", "LiveMapRow", "Window"]
 
 CellState: TypeAlias = Literal["resident", "stale", "zombie"]
 Shape: TypeAlias = Literal["circle", "square", "box"]
@@ -40,10 +38,10 @@ class Holder(msgspec.Struct, array_like=True, frozen=True):
 class CellRow(msgspec.Struct, array_like=True, frozen=True, gc=False):
     """A segment that the daemon keeps: one layer of one cell.
 
-    In the statistics ``id`` and ``segment`` lack the prefixes that `Welcome` gives, and ``holders`` is empty;
-    in `ShownCell` they are complete.  ``state`` is resident, stale (its source has changed) or zombie
-    (retired, but still in use).  ``bytes`` is its memory as measured, ``box`` (min_x, min_y, max_x, max_y) in
-    metres, map frame.  ``last_use_monotonic_ns`` is when it was last handed out (CLOCK_MONOTONIC), 0 for
+    In `CellsPage` ``id`` and ``segment`` lack the prefixes that `Welcome` gives, and ``holders`` is empty; in
+    `ShownCell` they are complete.  ``state`` is resident, stale (its source has changed) or "zombie"
+    (`retired`, but still in use).  ``bytes`` is its memory as measured, ``box`` (min_x, min_y, max_x, max_y)
+    in metres, map frame.  ``last_use_monotonic_ns`` is when it was last handed out (CLOCK_MONOTONIC), 0 for
     never; ``load_ns`` how long loading took; ``ahead`` marks a segment that was prefetched and not requested
     yet.
     """
@@ -61,6 +59,16 @@ class CellRow(msgspec.Struct, array_like=True, frozen=True, gc=False):
     load_ns: int = 0
     ahead: bool = False
     holders: tuple[Holder, ...] = ()
+
+    @property
+    def retired(self) -> bool:
+        """Whether it is out of service, freed when no process maps it; its ``state`` on the wire is older."""
+        return self.state == "zombie"
+
+    @property
+    def shown_state(self) -> str:
+        """Its state in the words of screens: resident, ahead (prefetched, not requested), stale, retired."""
+        return "retired" if self.retired else "ahead" if self.ahead else self.state
 
     def idle_s(self, now_monotonic_ns: int) -> float | None:
         """Return the seconds since the segment was last handed out; None if it never was."""
@@ -121,7 +129,7 @@ class LiveMapRow(msgspec.Struct, array_like=True, frozen=True):
     Attributes
     ----------
     chunks, active, bytes
-        Chunks in memory, known voxels in them, and their memory.
+        Chunks in memory, voxels known in them, and their memory.
     loading, dirty, saving
         Numbers of chunks being read, changed but not saved, and being written.
     waiting_bytes
@@ -131,8 +139,8 @@ class LiveMapRow(msgspec.Struct, array_like=True, frozen=True):
     scans, durable
         Number of scans applied since the start, and how many of them are on disk.
     damaged, mappers
-        Names of quarantined files and missing chunks; mappers as ``uid/name``.  In the statistics either may
-        be empty for lack of space; ``damaged_count`` and ``mapper_count`` are always set.
+        Lost chunks and damaged databases, 64 at most; mappers as ``uid/name``.
+        ``damaged_count`` and ``mapper_count`` count all.
     problem
         Reason why chunks cannot be saved or loaded at present; empty if they can.
     change

@@ -41,8 +41,6 @@ from shmmap.processes.request_threads import RequestThreads
 from shmmap.progress import Progress
 from shmmap.work_room import WorkRoom
 
-__all__ = ["FetchedMap", "fetch_map"]
-
 _CELLS: Final = "pointcloud_map.pcd"
 _NEW: Final = "new"  # directory of the files in writing: no cell's name can be that of one of them
 _FETCHED: Final = "fetched"

@@ -53,8 +53,6 @@ from shmmap.publishing.slicing import BaseVersion, changed_layers, new_objects, 
 if TYPE_CHECKING:
     from shmmap.publishing.signing import MapSigner
 
-__all__ = ["Joined", "join_slices", "numbers_text"]
-
 _OLD_S: Final = 6 * 86_400.0  # after seven days, pruning may remove objects that no version names
 _CONCURRENT_READS: Final = 16
 

@@ -20,20 +20,6 @@ from shmmap.origin.remote.published_object import ObjectName
 from shmmap.origin.remote.store import Store
 from shmmap.prepare.task_pool import Ready
 
-__all__ = [
-    "TASKS_AHEAD",
-    "CellSent",
-    "KnownObjects",
-    "LayerSent",
-    "NotSent",
-    "PublishSettings",
-    "SliceSettings",
-    "WorkerSettings",
-    "decode_sent",
-    "write_known_objects",
-]
-
-
 TASKS_AHEAD: Final = 8
 """Cells assigned to a worker at a time, so that finished cells are sent while the next one is made."""
 

@@ -40,18 +40,6 @@ from shmmap.publishing.messages import (
 if TYPE_CHECKING:
     from shmmap.publishing.signing import MapSigner
 
-__all__ = [
-    "CONCURRENT_REQUESTS",
-    "SentObject",
-    "absent_objects",
-    "begin_version",
-    "refuse_if_late",
-    "run_workers",
-    "send_object",
-    "send_packed",
-    "switch_version",
-]
-
 CONCURRENT_REQUESTS: Final = 32
 _YOUNG_S: Final = 86_400.0
 """Age below which an existing object is reused even if no version has it; pruning spares it much longer."""

@@ -32,8 +32,6 @@ from shmmap.origin.remote.store import Store, refuse_read_only
 from shmmap.progress import Progress
 from shmmap.publishing.restore import objects_of
 
-__all__ = ["KEEP_DAYS", "LEAST_KEEP_DAYS", "Pruned", "prune_versions"]
-
 KEEP_DAYS: Final = 30.0
 LEAST_KEEP_DAYS: Final = 7.0
 _DAY_S: Final = 86_400.0

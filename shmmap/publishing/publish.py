@@ -57,8 +57,6 @@ from shmmap.quantities import counted
 if TYPE_CHECKING:
     from shmmap.publishing.signing import MapSigner
 
-__all__ = ["Published", "packed_root", "publish_map"]
-
 _SHARDS_PER_BATCH: Final = 16
 
 

@@ -27,8 +27,6 @@ from shmmap.publishing.new_version import CONCURRENT_REQUESTS, absent_objects, b
 if TYPE_CHECKING:
     from shmmap.publishing.signing import MapSigner
 
-__all__ = ["Restored", "objects_of", "restore_version"]
-
 _NAMED: Final = 3
 
 

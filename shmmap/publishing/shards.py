@@ -22,8 +22,6 @@ from shmmap.origin.remote.published_index import (
 )
 from shmmap.publishing.messages import CellSent
 
-__all__ = ["CellObjects", "check_cells", "divide_into_shards", "shard_side"]
-
 _CELLS_ALONG_A_SHARD: Final = 32
 _MAX_CELLS: Final = 8192
 _OTHER_SIZE: Final = 4.0

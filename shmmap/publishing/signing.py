@@ -56,8 +56,6 @@ from shmmap.origin.remote.signed_metadata import (
 from shmmap.origin.remote.store import Store, put_over
 from shmmap.private_directory import require_private
 
-__all__ = ["LIFETIMES", "ROOT_FILE", "MapSigner", "Refreshed", "Rotated"]
-
 ROOT_FILE: Final = "ROOT.json"
 LIFETIMES: Final = {
     Root.type: timedelta(days=3652),

@@ -40,8 +40,6 @@ from shmmap.publishing.messages import TASKS_AHEAD, CellSent, KnownObjects, NotS
 from shmmap.publishing.worker import CellMaker, Sender, make_and_send, run_worker
 from shmmap.segment.version import Source, Stamp
 
-__all__ = ["HELD_BYTES", "PublishedPoints", "main"]
-
 HELD_BYTES: Final = 128 << 20
 """Size limit of fetched objects held in memory, since the next cells use some of the same neighbours."""
 _OF_THE_STORE: Final = (Offline.code, MapMissing.code)

@@ -67,8 +67,6 @@ from shmmap.publishing.new_version import (
 from shmmap.publishing.shards import CellObjects
 from shmmap.segment.version import Source
 
-__all__ = ["BaseVersion", "Sliced", "changed_layers", "new_objects", "prepare_slice", "read_base"]
-
 _THERE_S: Final = 4 * 86_400.0  # maximum age of a slice that is not made again; joining accepts six days
 _SHARDS_HELD: Final = 16
 _STRIP_CELLS: Final = 4

@@ -53,17 +53,6 @@ from shmmap.quantities import format_bytes
 from shmmap.segment.layout import SegmentHeader, SourceStamp
 from shmmap.segment.version import Source
 
-__all__ = [
-    "CellMaker",
-    "LayerRefused",
-    "MadeCell",
-    "RoundedFiles",
-    "Sender",
-    "main",
-    "make_and_send",
-    "run_worker",
-]
-
 _NICENESS: Final = 5
 _XYZ: Final = "xyz"
 

@@ -47,9 +47,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-__all__ = ["AttachedSegment", "Owned", "attach", "attach_writable", "map_file"]
-
-
 class Owned:
     """A resource that one built-in function acquires, and another releases when this object ends.
 

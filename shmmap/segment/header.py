@@ -36,24 +36,6 @@ from shmmap.segment.layout import (
     SourceStamp,
 )
 
-__all__ = [
-    "OUTSIDE",
-    "OUTSIDE_AT",
-    "PUBLISH_BYTES",
-    "PublishBlock",
-    "check_start",
-    "checked_blocks",
-    "pack_header",
-    "pack_publish_block",
-    "read_columns",
-    "read_header",
-    "read_page",
-    "unpack_header",
-    "unpack_publish_block",
-    "verify_file",
-]
-
-
 _BLOCK_BYTES: Final = 1 << 20
 PUBLISH_BYTES: Final = 64
 PUBLISH: Final = struct.Struct("<8sQQ32xI4x")

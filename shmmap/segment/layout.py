@@ -25,18 +25,6 @@ if TYPE_CHECKING:
 
     from shmmap.columns import ColumnSpec
 
-__all__ = [
-    "LAYOUT_VERSION",
-    "Column",
-    "ColumnRow",
-    "Lattice",
-    "SegmentHeader",
-    "SourceStamp",
-    "header_size",
-    "plan_arrays",
-    "plan_columns",
-]
-
 LAYOUT_VERSION: Final = (1, 3)
 PAGE_BYTES: Final = 4096
 ALIGNMENT_BYTES: Final = 64

@@ -18,21 +18,6 @@ from typing import Final
 
 from shmmap.errors import CannotStart, ConfigError
 
-__all__ = [
-    "DEFAULT_SHM_DIR",
-    "HUGE_PAGES_DIR",
-    "another_name",
-    "check_instance",
-    "is_retired",
-    "name_taken",
-    "new_segment_name",
-    "retired_name",
-    "segment_prefix",
-    "statistics_name",
-    "usual_directory",
-]
-
-
 DEFAULT_SHM_DIR: Final = "/dev/shm"  # noqa: S108
 """Where ``shm_open`` puts segments on Linux."""
 HUGE_PAGES_DIR: Final = "/run/shmmap_huge"

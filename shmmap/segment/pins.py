@@ -19,17 +19,6 @@ from typing import Final
 
 from shmmap.failpoints import step
 
-__all__ = [
-    "LOADER_SLOT",
-    "MAX_SLOT",
-    "has_slot",
-    "holders",
-    "in_use",
-    "keep_if_unused",
-    "lock_slot",
-    "prepare_process",
-]
-
 MAX_SLOT: Final = (1 << 62) - 1
 MAX_RANGES: Final = 32
 TIMEOUT_S: Final = 0.02

@@ -19,17 +19,6 @@ from typing import Final
 
 from shmmap.errors import LimitReached
 
-__all__ = [
-    "check_files",
-    "check_threads",
-    "file_size_limit",
-    "limit_behind",
-    "no_files_left",
-    "no_memory_left",
-    "no_threads_left",
-    "raise_limit_behind",
-]
-
 _GONE_S: Final = 0.0001
 _NO_ROOM: Final = ("Cannot allocate memory", "failed to map segment")
 """Messages of the dynamic loader for a library for which there is no memory."""

@@ -17,13 +17,6 @@ from typing import Final, TypeAlias
 import msgspec
 from xxhash import xxh3_64_intdigest
 
-__all__ = [
-    "Source",
-    "Stamp",
-    "cell_version",
-    "layer_version",
-]
-
 
 class Source(msgspec.Struct, frozen=True, array_like=True):
     """Source of a cell's points.

@@ -31,14 +31,6 @@ from shmmap.segment.layout import (
     plan_columns,
 )
 
-__all__ = [
-    "SegmentOrigin",
-    "SegmentWriter",
-    "write_all",
-    "write_table",
-]
-
-
 PIECE_BYTES: Final = 1 << 16
 """Bytes per write, about 30 us: between writes other work may run on this processor.  Otherwise a client just
 woken by its reply would wait until the loader on the same processor blocks."""

@@ -14,8 +14,6 @@ from typing import Final
 
 from shmmap.errors import BadRequest, CannotWrite
 
-__all__ = ["FileSystem"]
-
 _MAX_LINKS: Final = 40  # links in one path, as in Linux
 
 

@@ -12,8 +12,6 @@ from typing import Final
 
 from shmmap.errors import BadRequest, ConfigError
 
-__all__ = ["DROP_IN", "MOUNT", "check_possible", "kernel_version", "of_all_sizes"]
-
 MOUNT: Final = "system/run-shmmap_huge.mount"
 DROP_IN: Final = "drop-ins/huge-pages.conf"
 

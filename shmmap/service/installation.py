@@ -21,24 +21,13 @@ from shmmap.service.file_system import FileSystem
 from shmmap.service.huge_pages import DROP_IN, MOUNT
 from shmmap.service.program import Program, command_line, is_hidden, quoted
 
-__all__ = [
-    "PlannedFile",
-    "configuration",
-    "plan_system",
-    "plan_user",
-    "shipped_directory",
-    "shipped_names",
-    "shipped_text",
-    "unit_text",
-    "write",
-]
-
-
 EXAMPLE_MAP = "/var/lib/shmmap/maps"
 
 SHIPPED_PROGRAM = "/usr/bin/shmmapd"
 
 SHIPPED_BRIDGE = "/usr/bin/shmmap-ros-bridge"
+
+SHIPPED_METRICS = "/usr/bin/shmmap metrics"
 
 PUBLISHED_MAP = "drop-ins/published-map.conf"
 
@@ -94,6 +83,7 @@ def unit_text(name: str, program: Program | None = None) -> str:
     """Return a shipped unit that starts a program, by default this installation."""
     program = program or Program.this_one()
     text = shipped_text(name).replace(SHIPPED_PROGRAM, command_line(program.daemon))
+    text = text.replace(SHIPPED_METRICS, command_line(program.metrics))
     return text.replace(SHIPPED_BRIDGE, command_line(program.bridge))
 
 
@@ -198,8 +188,10 @@ def plan_system(
         if name.startswith("system/") and not name.endswith(".mount")
     ]
     why = "This Python lies where ProtectHome= or PrivateTmp= would hide it."
-    for service in ("shmmapd.service", "shmmapd@.service", "shmmap-ros-bridge.service"):
-        planned += _drop_in(place(*units, f"{service}.d", "10-program.conf"), program.hidden_directories, why)
+    for service in ("shmmapd", "shmmapd@", "shmmap-ros-bridge", "shmmap-metrics"):
+        planned += _drop_in(
+            place(*units, f"{service}.service.d", "10-program.conf"), program.hidden_directories, why
+        )
     if map_path:
         shown = [map_path] if not is_remote and is_hidden(map_path) else []
         why = "The map lies where ProtectHome= or PrivateTmp= would hide it."

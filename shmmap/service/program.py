@@ -20,16 +20,6 @@ from typing import Final
 from shmmap.errors import ConfigError
 from shmmap.service.file_system import FileSystem
 
-__all__ = [
-    "INSTALL_FOR_SERVICE",
-    "INSTALL_IN_IMAGE",
-    "Program",
-    "command_line",
-    "is_hidden",
-    "outermost",
-    "quoted",
-]
-
 INSTALL_FOR_SERVICE: Final = "python3 -m venv /opt/shmmap && /opt/shmmap/bin/pip install ."
 """Commands for root, in a checkout, to install the program where a machine's units can start it."""
 INSTALL_IN_IMAGE: Final = (
@@ -109,6 +99,12 @@ class Program:
         real = file_system.resolve(python)
         places = (os.path.dirname(folder), os.path.dirname(os.path.dirname(real)))
         return cls((script,), start_bridge, places, (*places, script, real), file_system)
+
+    @property
+    def metrics(self) -> tuple[str, ...]:
+        """Command that prints metrics, of the installation that has the daemon."""
+        *before, last = self.daemon
+        return (*before, "shmmap.cli" if before else last.removesuffix("d"), "metrics")
 
     @property
     def hidden_directories(self) -> list[str]:

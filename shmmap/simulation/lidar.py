@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 from shmmap.simulation.town import Town
 from shmmap.simulation.town_surfaces import BLOCK_METRES
 
-__all__ = ["Lidar", "LidarDrive", "LidarReturns", "LidarScan", "Traffic"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LidarReturns:

@@ -20,8 +20,6 @@ from shmmap.errors import BadRequest
 from shmmap.simulation.town_blocks import build_block
 from shmmap.simulation.town_surfaces import BLOCK_METRES, ROAD_HALF_METRES, Ground, Surfaces, street_distance
 
-__all__ = ["Town", "drive"]
-
 _GROUND_NOISE_METRES = 0.015
 _FOOTPRINT_METRES = 0.25  # cells of the raster in which buildings hide the ground
 _ASPHALT, _PAINT, _PAVING, _GRASS = 22.0, 130.0, 48.0, 72.0

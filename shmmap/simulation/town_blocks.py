@@ -10,8 +10,6 @@ import numpy as np
 
 from shmmap.simulation.town_surfaces import BLOCK_METRES, ROAD_HALF_METRES, Surfaces
 
-__all__ = ["build_block"]
-
 Rng = np.random.Generator
 Height = Callable[[float, float], float]
 """Height of the ground at tile coordinates."""

@@ -13,8 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["BLOCK_METRES", "CURB_METRES", "ROAD_HALF_METRES", "Ground", "Surfaces"]
-
 BLOCK_METRES = 80.0
 """Distance between street centre lines, in x and in y."""
 ROAD_HALF_METRES = 4.0

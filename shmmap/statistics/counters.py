@@ -6,25 +6,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final, Literal, NamedTuple
 
-__all__ = [
-    "BUCKETS",
-    "COUNTERS",
-    "COUNTER_NAMES",
-    "FIRST_EXPONENT",
-    "HISTOGRAMS",
-    "OBJECTS_READ",
-    "PUBLISHED",
-    "REFUSALS",
-    "SPANS",
-    "STEPS",
-    "TURN_KINDS",
-    "WINDOWED",
-    "Counter",
-    "Histogram",
-    "bucket_of",
-    "lower_bound_ns",
-]
-
 
 class Counter(NamedTuple):
     """One number the daemon keeps.
@@ -79,8 +60,20 @@ OBJECTS_READ: Final = {
 }
 """Counters of objects that the daemon of a published map and its loaders read: unit and help."""
 
+LINK_CAUSES: Final = {
+    "demand": "Bytes that came over the link for cells that clients asked for",
+    "ahead": "Bytes that came over the link for cells that no client had asked for yet",
+    "index": "Bytes that came over the link for the list of cells",
+}
+"""What the link to a published map's origin is used for; the counters are ``link_CAUSE_bytes``."""
+
 _PUBLISHED: Final = (
     *(Counter(name, "counter", unit, text) for name, (unit, text) in OBJECTS_READ.items()),
+    *(Counter(f"link_{cause}_bytes", "counter", "bytes", text) for cause, text in LINK_CAUSES.items()),
+    Counter(
+        "link_rate_bytes", "gauge", "bytes", "Greatest rate of the link lately, a second; 0: not known yet"
+    ),
+    Counter("link_under_way_bytes", "gauge", "bytes", "Bytes that have been asked for over the link"),
     Counter("published_version", "gauge", "", "Number of the published version that is served; 0: files"),
     Counter("published_refused", "gauge", "", "Number of a version that is offered and refused; 0: none"),
     Counter("published_taken_unix_ns", "gauge", "ns", "When the version served was taken, wall clock"),
@@ -199,6 +192,17 @@ COUNTERS: Final = (
         Counter(f"{name}_{span}", "gauge", "", f"{text}, in the last {span}")
         for name, text in WINDOWED.items()
         for span in SPANS
+    ),
+    Counter("layers_prepared", "counter", "", "Layers computed into the disk cache before clients asked"),
+    Counter("prepare_cells", "gauge", "", "Cells' layers that the setting prepare names"),
+    Counter("prepare_done", "gauge", "", "Cells' layers of it that are in the disk cache"),
+    Counter("prepare_failed", "gauge", "", "Cells' layers of it that cannot be made; the log names them"),
+    Counter("prepare_retries", "gauge", "", "Of these, those whose loader was killed, to be tried again"),
+    Counter(
+        "prepare_short",
+        "gauge",
+        "",
+        "What keeps layers from being prepared: 0 nothing, 1 cache_size is too small, 2 no writing",
     ),
     Counter("origin_out_since_unix_ns", "gauge", "ns", "Since when origin_out is 1, wall clock; else 0"),
     *_PUBLISHED,

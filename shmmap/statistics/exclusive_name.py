@@ -20,8 +20,6 @@ from shmmap.segment.directory import ShmDirectory, is_full
 from shmmap.segment.names import name_taken, new_segment_name, statistics_name
 from shmmap.statistics.reader import read_statistics
 
-__all__ = ["has_writer", "hold", "refuse_second", "take_name"]
-
 _FLOCK: Final = struct.Struct("@hhqqi4x")  # struct flock of 64-bit Linux: type, whence, start, len, pid
 _OFD_GETLK: Final = 36
 _OFD_SETLK: Final = 37

@@ -13,8 +13,6 @@ from typing import Final, Literal, TypeAlias
 
 from shmmap.errors import SegmentCorrupt
 
-__all__ = ["DaemonIdentity", "DaemonState", "WriterProcess", "pid_namespace", "start_time_ticks"]
-
 DaemonState: TypeAlias = Literal["healthy", "starting", "stopped", "hung", "dead"]
 
 HUNG_AFTER_S: Final = 5.0
@@ -55,11 +53,15 @@ class DaemonIdentity:
     map_path, map_version, frame_id
         The map as configured, 64-bit hash of its catalogue, frame of its coordinates.
     id_prefix
-        Prefix that the ids in the cell table lack.
+        Prefix that ids of cells lack in the daemon's replies.
     library_version
         Version of shmmap the daemon runs.
     started_unix_ns
         Wall-clock start of this run.
+    prepare
+        Layers that it prepares for every cell, separated by blanks.
+    live
+        Names of the live maps that it keeps, separated by blanks.
     """
 
     pid: int
@@ -75,6 +77,8 @@ class DaemonIdentity:
     library_version: str
     started_unix_ns: int
     frame_id: str = "map"
+    prepare: str = ""
+    live: str = ""
 
     def to_bytes(self) -> bytes:
         """Return name and value of every attribute, each ended by a NUL."""
@@ -112,6 +116,8 @@ class DaemonIdentity:
                 library_version=found["library_version"],
                 started_unix_ns=int(found["started_unix_ns"]),
                 frame_id=found.get("frame_id", "map"),
+                prepare=found.get("prepare", ""),
+                live=found.get("live", ""),
             )
         except (KeyError, ValueError) as error:
             raise SegmentCorrupt(f"the statistics' identity is damaged: {error}") from error

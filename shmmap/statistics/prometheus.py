@@ -15,20 +15,18 @@ from shmmap.statistics.reader import Snapshot
 if TYPE_CHECKING:
     from shmmap.protocol.rows import LiveMapRow
 
-__all__ = ["exposition"]
-
 _LIVE = {
     # attribute of a row: name, kind, help
     "states": ("chunks", "gauge", "Chunks by state"),
     "bytes": ("bytes", "gauge", "Memory of chunks in service"),
     "waiting_bytes": ("waiting_bytes", "gauge", "Scans that wait for chunks or for memory"),
     "budget_bytes": ("budget_bytes", "gauge", "Most memory of the map's chunks"),
-    "active": ("active_voxels", "gauge", "Known voxels in memory"),
+    "active": ("known_voxels", "gauge", "Voxels known of the chunks in memory"),
     "files": ("files", "gauge", "Chunks on disk"),
     "file_bytes": ("file_bytes", "gauge", "Chunks on disk: bytes of their files"),
     "scans": ("scans_applied_total", "counter", "Scans applied"),
     "durable": ("scans_durable_total", "counter", "Scans applied that are on disk"),
-    "damaged_count": ("damaged_files", "gauge", "Damaged files in quarantine, and missing chunks"),
+    "damaged_count": ("damaged_files", "gauge", "Lost chunks, and damaged databases"),
     "failing": ("failing", "gauge", "1 while chunks cannot be loaded or saved"),
 }
 
@@ -43,6 +41,8 @@ def exposition(found: Snapshot, instance: str) -> str:
 
     Parameters
     ----------
+    found
+        Statistics, with the live maps that the daemon lists.
     instance
         Label ``daemon`` of every sample (``instance`` is Prometheus' own label).
     """
@@ -85,6 +85,7 @@ def _lines(found: Snapshot, instance: str) -> Iterator[str]:
             continue
         if name in _NO_TIME_IF_0 and not value:
             continue
+        name = _conventional(name)
         if counter.unit == "ns":
             name = name.replace("_unix_ns", "_timestamp_ns").removesuffix("_ns") + "_seconds"
             value *= 1e-9
@@ -97,6 +98,12 @@ def _lines(found: Snapshot, instance: str) -> Iterator[str]:
         yield f"# HELP {name} {_escaped_help(described.help)}"
         yield f"# TYPE {name} histogram"
         yield from _histogram(name, label, found.histograms[described.name])
+
+
+def _conventional(name: str) -> str:
+    """Return a counter's name as Prometheus' conventions have it: the unit last."""
+    name = name.replace("zombies", "retired_segments").replace("zombie", "retired")
+    return f"{name.removeprefix('bytes_')}_bytes" if name.startswith("bytes_") else name
 
 
 def _live_maps(rows: Sequence[LiveMapRow], label: str) -> Iterator[str]:

@@ -11,7 +11,7 @@ import stat
 import time
 from functools import cached_property
 from types import TracebackType
-from typing import TYPE_CHECKING, Literal, TypeVar
+from typing import TYPE_CHECKING, Literal
 
 from shmmap.errors import NotPermitted, SegmentCorrupt
 from shmmap.segment.names import DEFAULT_SHM_DIR, statistics_name
@@ -19,7 +19,6 @@ from shmmap.statistics.counters import Counter, Histogram
 from shmmap.statistics.identity import DaemonIdentity, DaemonState, WriterProcess
 from shmmap.statistics.layout import (
     IDENTITY,
-    TABLE,
     Header,
     State,
     unpack_header,
@@ -28,21 +27,16 @@ from shmmap.statistics.layout import (
 )
 
 if TYPE_CHECKING:
-    import msgspec
+    from collections.abc import Sequence
 
-    from shmmap.protocol.rows import CellRow, ClientRow, LiveMapRow
-
-__all__ = ["Snapshot", "StatisticsReader", "read_statistics"]
-
-_Row = TypeVar("_Row", bound="msgspec.Struct")
+    from shmmap.protocol.rows import ClientRow, LiveMapRow
 
 _ATTEMPTS = 100
-_TABLE_ATTEMPTS = 16
 _HEADER_BYTES = 16384
 
 
 class Snapshot:
-    """The statistics at one moment.
+    """The statistics at one moment, and beside them what a daemon has answered.
 
     Attributes
     ----------
@@ -56,10 +50,10 @@ class Snapshot:
         Seconds since the daemon last wrote; infinite when absent.
     beat_monotonic_ns : int
         Time of that write, CLOCK_MONOTONIC.
-    rows_missing : int
-        Number of cells for which the table had no room.
     size_bytes : int
         Memory of the segment.
+    clients, live
+        Clients and live maps, which only the daemon lists; None and empty until it has.
     """
 
     def __init__(
@@ -71,20 +65,15 @@ class Snapshot:
         *,
         beat_age_s: float = float("inf"),
         size_bytes: int = 0,
-        rows: bytes = b"",
-        clients: bytes = b"",
-        live: bytes = b"",
     ) -> None:
         self.identity = identity
         self.beat_age_s = beat_age_s
         self.beat_monotonic_ns = values.beat_monotonic_ns if values is not None else 0
-        self.rows_missing = values.rows_missing if values is not None else 0
         self.size_bytes = size_bytes
+        self.clients: Sequence[ClientRow] | None = None
+        self.live: Sequence[LiveMapRow] = ()
         self._header = header
         self._values = values
-        self._rows = rows
-        self._clients = clients
-        self._live = live
         self.state: DaemonState | Literal["absent"] = state
         if state == "healthy" and self.counters.get("starting"):
             self.state = "starting"
@@ -119,51 +108,6 @@ class Snapshot:
             for index, description in enumerate(self._header.histograms)
             if (index + 1) * step <= len(values)
         }
-
-    @cached_property
-    def cells(self) -> list[CellRow]:
-        """The segments the daemon keeps, in id order, then layer and version.
-
-        A row that the daemon was changing at that moment (it was stopped during a write) is left out.
-        """
-        from shmmap.protocol.rows import CellRow
-
-        step = self._header.row_bytes if self._header is not None else 0
-        return sorted(_in_use(CellRow, self._rows, step), key=lambda row: (row.id, row.layer, row.version))
-
-    @cached_property
-    def clients(self) -> list[ClientRow]:
-        """The clients in the table, which may lack room for all, in order of arrival."""
-        from shmmap.protocol.rows import ClientRow
-
-        step = self._header.client_row_bytes if self._header is not None else 0
-        return _in_use(ClientRow, self._clients, step)
-
-    @cached_property
-    def live(self) -> list[LiveMapRow]:
-        """The live maps that the daemon keeps."""
-        if not self._live.strip(b"\0"):
-            return []  # saves the import: most daemons keep no live maps
-        from shmmap.protocol.rows import LiveMapRow
-
-        step = self._header.live_row_bytes if self._header is not None else 0
-        return _in_use(LiveMapRow, self._live, step)
-
-
-def _in_use(kind: type[_Row], data: bytes, step: int) -> list[_Row]:
-    """Return the rows of a table that are in use, except those that were being changed."""
-    from shmmap.statistics.rows import unpack_row
-
-    found = []
-    view = memoryview(data)
-    for at in range(0, len(view) - step + 1, step) if step else ():
-        try:
-            row = unpack_row(kind, view[at : at + step])
-        except SegmentCorrupt:
-            continue
-        if row is not None:
-            found.append(row)
-    return found
 
 
 class StatisticsReader:
@@ -203,15 +147,8 @@ class StatisticsReader:
         self._header = None
         self._identity_heads = []
 
-    def snapshot(self, *, tables: bool = True, cells: bool = True) -> Snapshot:
-        """Read the statistics as they are now.
-
-        Parameters
-        ----------
-        tables
-            Copy the rows of cells and clients, too; without them a snapshot takes some microseconds.
-        cells
-            Copy the rows of cells, 256 bytes each.
+    def snapshot(self) -> Snapshot:
+        """Read the statistics as they are now, which takes some microseconds.
 
         Raises
         ------
@@ -246,7 +183,6 @@ class StatisticsReader:
         identity, process = self._who(header)
         state = _newest_state(self._fd, header)
         age_s = (time.monotonic_ns() - state.beat_monotonic_ns) * 1e-9
-        clients, live = (min(state.clients_used, header.max_clients), header.max_live) if tables else (0, 0)
         return Snapshot(
             process.state(age_s),
             identity,
@@ -254,9 +190,6 @@ class StatisticsReader:
             state,
             beat_age_s=max(age_s, 0.0),
             size_bytes=status.st_blocks * 512,
-            rows=_rows(self._fd, header, state.rows_used) if tables and cells else b"",
-            clients=_table(self._fd, header.clients_offset, clients * header.client_row_bytes),
-            live=_table(self._fd, header.live_offset, live * header.live_row_bytes),
         )
 
     def _who(self, header: Header) -> tuple[DaemonIdentity, WriterProcess]:
@@ -303,12 +236,8 @@ def _read_header(fd: int, size: int) -> Header:
         data += os.pread(fd, 65536, len(data))
         header = unpack_header(data)
         _last_header = data[: header.descriptions_end], header
-    end = max(
-        header.identity_offset + 2 * header.identity_bytes, header.state_offset + 2 * header.state_bytes,
-        header.table_offset + TABLE.size, header.rows_offset, header.clients_offset,
-    )  # fmt: skip
-    if end > size or header.row_bytes < 256:
-        raise SegmentCorrupt(f"the statistics claim {end} bytes and more, there are {size}")
+    if header.end > size:
+        raise SegmentCorrupt(f"the statistics claim {header.end} bytes, there are {size}")
     return header
 
 
@@ -343,24 +272,3 @@ def _newest_state(fd: int, header: Header) -> State:
             if state is not None:
                 return state
     raise SegmentCorrupt("the statistics' counters are damaged")
-
-
-def _rows(fd: int, header: Header, used: int) -> bytes:
-    """Copy the table consistently if the writer pauses, else row by row (each row has a checksum)."""
-    nbytes = _within(fd, header.rows_offset, min(used, header.max_rows) * header.row_bytes)
-    rows = b""
-    for _ in range(_TABLE_ATTEMPTS):
-        before = os.pread(fd, TABLE.size, header.table_offset)
-        rows = os.pread(fd, nbytes, header.rows_offset)
-        if before == os.pread(fd, TABLE.size, header.table_offset) and not TABLE.unpack(before)[0] % 2:
-            break
-    return rows
-
-
-def _table(fd: int, offset: int, nbytes: int) -> bytes:
-    return os.pread(fd, _within(fd, offset, nbytes), offset)
-
-
-def _within(fd: int, offset: int, nbytes: int) -> int:
-    """Return how many of these bytes exist, since pread allocates the whole requested length."""
-    return max(0, min(nbytes, os.fstat(fd).st_size - offset))

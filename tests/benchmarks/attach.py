@@ -24,8 +24,6 @@ from shmmap.segment.directory import DEFAULT_SHM_DIR, ShmDirectory
 from shmmap.segment.header import PublishBlock
 from tests.support.segments import publish_segment
 
-__all__ = ["main"]
-
 
 def publish(directory: ShmDirectory, number: int, points: int) -> tuple[str, Handle]:
     """Make one published segment of random points, as the daemon does."""

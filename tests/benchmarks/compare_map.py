@@ -37,8 +37,6 @@ from shmmap.simulation.town import Town
 from tests.benchmarks.street_data import street
 from tests.support.daemon_process import DaemonProcess
 
-__all__ = ["main"]
-
 SCANS_PER_UPDATE = 10
 Scene = tuple[NDArray[np.float32], NDArray[np.float64], "NDArray[np.bool_] | None"]
 

@@ -25,8 +25,6 @@ from tests.support.compiled_programs import ControlLoop, Rounds, compiled_loop
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import make_map
 
-__all__ = ["main"]
-
 WAIT_S = 0.02
 LIMIT_S = WAIT_S + 0.005
 

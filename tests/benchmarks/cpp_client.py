@@ -12,6 +12,10 @@ Attaching: 256 unmapped cells, from the arrival of the answer on, a cell; Python
 it, with a column of each.
 
 Memory: eight processes that hold the same 100 MB.
+
+Measured beside those of BENCHMARKS.md: of a request 7 to 15 us pass in the client itself; mapping a cell
+takes 0.56 to 0.67 of the Python client's time; each of eight processes that hold 105 MB has 0.6 MiB of its
+own.
 """
 
 from __future__ import annotations
@@ -30,8 +34,6 @@ from tests.benchmarks.warm_request import BLOCK, NEW, Warm, time_block
 from tests.support.cpp_client import INCLUDE
 from tests.support.daemon_process import DaemonProcess, LineProcess
 from tests.support.divided_map import make_map
-
-__all__ = ["main"]
 
 PROCESSES = 8
 

@@ -13,6 +13,9 @@ runs twice in a process of its own, first to build, then to write NPZ, GeoTIFF, 
 what it built; its anonymous memory (RssAnon, interpreter and libraries included) is sampled all the time.
 
     python -m tests.benchmarks.elevation_map [--sides 10,32,100] [--density 400] [--json]
+
+Measured: heights of 0.3 m columns of 36 exact points are off by 0.5 mm (median) and 3.8 mm (largest), with
+noise of 15 mm by 1.8 and 12.4 mm; peak private memory 68 MiB for 100 cells, 70 MiB for 10 000.
 """
 
 from __future__ import annotations
@@ -36,8 +39,6 @@ import shmmap
 from shmmap.simulation.town import Town
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import write_pcd
-
-__all__ = ["main"]
 
 CELL_METRES = 20
 CELL_POINTS = 1500

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Programs that end while a thread of theirs asks the daemon: each has to end by itself and say nothing.
 
-Threads use the main thread's client, one of their own, one after the other, a window, or an event stream.
-Prints, for each, how many programs ended by a signal, with another exit code, or said anything.
+Threads use the main thread's client, futures of it, one of their own, one after the other, a window, or an
+event stream.  Prints, for each, how many programs ended by a signal, with another exit code, or said
+anything.
 
     python -m tests.benchmarks.exits
 """
@@ -40,6 +41,7 @@ time.sleep(after_s)
 
 SCENES: Final = {
     "shared client": ("client = shmmap.connect(endpoint)", "client.around(0, 0, 50)"),
+    "futures": ("client = shmmap.connect(endpoint)", "client.futures.around(0, 0, 50).result()"),
     "own client": (
         "from shmmap.events import EventStream; own = threading.local()",
         "own.client = getattr(own, 'client', None) or shmmap.connect(endpoint); own.client.around(0, 0, 50)",

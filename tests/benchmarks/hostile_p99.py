@@ -29,8 +29,6 @@ import sys
 import tempfile
 from pathlib import Path
 
-__all__ = ["main"]
-
 
 def main() -> int:
     """Play what was asked for, and print what came of it."""

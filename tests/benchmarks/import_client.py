@@ -15,8 +15,6 @@ import os
 import statistics
 import sys
 
-__all__ = ["main"]
-
 _NOTHING = "pass"
 _PACKAGES = "import numpy, zmq, posix_ipc, msgspec"
 _CLIENT = "import shmmap; shmmap.connect; shmmap.MapWindow"

@@ -3,10 +3,10 @@
 
     python -m tests.benchmarks.interrupts [--interrupts 100000] [--seed 1]
 
-A timer's handler raises in the midst of requests, of attaching, of connecting, of a window's calls and of
-following events, once or up to three times in a row, so that it hits what cleans up, too.  After each, the
-client must answer; in the end it must close, and the process have the descriptors, mappings of segments and
-threads of before.  What it has beyond them is printed by kind.
+A timer's handler raises in the midst of requests, of attaching, of connecting, of a window's calls, of
+waiting for futures and of following events, once or up to three times in a row, so that it hits what cleans
+up, too.  After each, the client must answer; in the end it must close, and the process have the descriptors,
+mappings of segments and threads of before.  What it has beyond them is printed by kind.
 """
 
 from __future__ import annotations
@@ -31,8 +31,6 @@ import shmmap
 from shmmap.errors import Busy
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import make_map
-
-__all__ = ["main"]
 
 SETTLED_S = 30.0
 IN_A_ROW = 3
@@ -121,11 +119,20 @@ def main(argv: list[str] | None = None) -> int:
             first.move_to(0, 0, wait=60)
         del first
         shmmap.events.EventStream(one.endpoint).close()
+        with shmmap.connect(one.endpoint) as second:
+            second.futures.around(0, 0, 30).result()  # the thread that completes them stays
         begun = holdings(one.shm_dir)
         interrupter, chance = Interrupter(options.seed), random.Random(options.seed)
         client: Any = shmmap.connect(one.endpoint, timeout=20)
         window: Any = shmmap.MapWindow(client, 30, update_distance=0)
         blocking: Any = shmmap.MapWindow(client, 30, update_distance=0, background=False)
+
+        def asked_together() -> None:
+            futures = [client.futures.around(0, 0, radius) for radius in (5, 10, 30)]
+            futures[0].result()
+            futures[1].cancel()
+            client.stats()
+            futures[2].result()
 
         def moved(which: shmmap.MapWindow) -> None:
             which.move_to(chance.uniform(-40, 40), chance.uniform(-40, 40), wait=0.05)
@@ -134,6 +141,7 @@ def main(argv: list[str] | None = None) -> int:
             # what is done, the longest time before it is interrupted, its share
             "attaching": (lambda: client.around(0, 0, 30), 2e-3, 50),
             "requests": (client.stats, 1e-3, 20),
+            "futures": (asked_together, 4e-3, 20),
             "window moved": (lambda: moved(window), 2e-3, 10),
             "blocking window moved": (lambda: moved(blocking), 2e-3, 15),
             "connecting": (lambda: shmmap.connect(one.endpoint), 2e-2, 4),
@@ -163,7 +171,7 @@ def main(argv: list[str] | None = None) -> int:
                 break
         for opened in (window, blocking, client):
             opened.close()
-        del opened, work
+        del opened, work, second
         scenes.clear()
         window = blocking = client = None
         shmmap.connect(one.endpoint).close()  # ends what was left open

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scans into a live map beside OctoMap's ``insertPointCloud``, and the memory that the map takes.
 
-    SHMMAP_TEST_DATA=DIR python -m tests.benchmarks.live_insertion [--rounds 3] [--setting 0.2/30]
+    SHMMAP_TEST_DATA=DIR python -m tests.benchmarks.live_insertion [--rounds 3] [--setting 0.2/30] [--alone]
 
 CPU time of mapper and worker together: a scan is marked, written as a file and read again as the worker does
 it, checked, and applied to chunks in shared memory, under the undo record.  OctoMap gets the same points,
 already in the map's frame; all three take turns scan by scan, each with a map of its own that begins empty
 with each round.  Limit at 0.2 m, 30 m: 30 times as many points a second as OctoMap with the better of its two
-settings.  OctoMap's part needs g++ and liboctomap-dev, and is left out where they are missing.
+settings.  OctoMap's part needs g++ and liboctomap-dev, and is left out with ``--alone`` or where they are
+missing.  A setting is any voxel and range, in metres.
 
 Memory is what the file system counts for all chunks, headers included, before and after a client has read
 every byte that can be mapped.  Limits, bytes for each known voxel: 4.0 at 0.2 m, 30 m; 3.0 at 0.05 m, 5 m.
@@ -203,6 +204,8 @@ def measure(setting: str, scans: Sequence[Scan], peers: dict[str, OctoMap], roun
             if turn == 0:
                 good = print_memory(setting, ours)
             ours.close()
+    milliseconds = np.median(seconds["shmmap"]) / len(scans) * 1e3
+    print(f"  CPU time a scan of {points // len(scans):,} points, mapper and worker: {milliseconds:.1f} ms")
     print(f"  points a second, millions, median of {rounds} rounds:")
     for name, values in seconds.items():
         print(f"    {name:20} {points / np.median(values) / 1e6:6.2f}")
@@ -236,7 +239,8 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--setting", choices=SETTINGS, action="append", help="voxel and range, metres")
+    parser.add_argument("--setting", action="append", help="voxel and range, metres, such as 0.1/30")
+    parser.add_argument("--alone", action="store_true", help="without OctoMap")
     args = parser.parse_args()
     data_dir()  # it says what is missing
     good = True
@@ -246,7 +250,7 @@ def main() -> int:
         points = sum(len(scan.points) for scan in scans)
         print(f"load {os.getloadavg()[0]:.2f}; {len(scans)} scans, {points:,} points")
         peers: dict[str, OctoMap] = {}
-        if (program := built_octomap(folder)) is not None:
+        if not args.alone and (program := built_octomap(folder)) is not None:
             peers["OctoMap"] = OctoMap(program, discretize=False)
             peers["OctoMap, discretised"] = OctoMap(program, discretize=True)
         for setting in args.setting or SETTINGS:

@@ -33,8 +33,6 @@ from shmmap.simulation.lidar import Lidar
 from shmmap.simulation.town import Town
 from tests.benchmarks.street_data import SENSOR_HEIGHT_M, sampled
 
-__all__ = ["make_data"]
-
 BLOCKS = (2, 2)
 SEED = 3
 STREET_Y_M = 78.5  # the right lane, driven towards +x

@@ -12,9 +12,10 @@ off, a call left out.  The same seed draws the same mutants of the same code.  T
 packages and, in each, over the kinds.
 
 ``run`` copies the tree, breaks the copy, and runs tests there, stage by stage, until the first failure;
-mutant by mutant.  Each is printed with what caught it, or as a survivor.  A stage is a word as pytest takes
-them; ``own`` are the unit tests of the package (default: `STAGES`).  Where tests fail at random a mutant
-counts as caught only if the first test that failed passes in the copy that is not broken.
+mutant by mutant.  Each is printed with what caught it, or as a survivor.  A stage is words as pytest takes
+them; ``own`` are the unit tests of the package, ``--all own`` also the slow ones (default: `STAGES`).  Where
+tests fail at random a mutant counts as caught only if the first test that failed passes in the copy that is
+not broken.
 
 ``--together N`` spares most of the time where whole stages are run and few mutants are caught: each stage is
 run once with N mutants in the copy.  What fails then is run with each of them alone, and where some are
@@ -43,8 +44,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
-
-__all__ = ["Mutant", "carry", "caught_together", "draw", "mutants_of"]
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 PACKAGES: Final = (
@@ -267,6 +266,10 @@ def carry(mutant: Mutant, old: Path, new: Path) -> Mutant | None:
     return found[0] if len(found) == 1 else None
 
 
+def _is_own(stage: str) -> bool:
+    return OWN in stage.split()
+
+
 def _own_tests(tree: Path, path: str) -> str:
     """Return the folder of unit tests nearest to a module; empty if it has none."""
     folder = Path(path).parent
@@ -366,9 +369,12 @@ def _caught_by(mutant: Mutant, whole: Path, broken: Path, stages: Sequence[str],
     """Return what catches a mutant; empty if nothing does."""
     with _broken(broken, [mutant]):
         for stage in stages:
-            tests = _own_tests(whole, mutant.path) if stage == OWN else stage
-            one_at_a_time = ("-n", "0") if stage == OWN else ()
-            failed = _first_failure(broken, tests, limit_s, *one_at_a_time) if tests else ""
+            tests, one_at_a_time = stage, tuple[str, ...]()
+            if _is_own(stage):
+                if not (own := _own_tests(whole, mutant.path)):
+                    continue
+                tests, one_at_a_time = stage.replace(OWN, own), ("-n", "0")
+            failed = _first_failure(broken, tests, limit_s, *one_at_a_time)
             if failed and (" " in failed or not _first_failure(whole, failed, limit_s, "-n", "0")):
                 return failed
             if failed:
@@ -388,7 +394,7 @@ def _run(args: argparse.Namespace) -> None:
     caught: dict[int, str] = {}
     with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
         whole, broken = _copy(args.tree, Path(folder, "whole")), _copy(args.tree, Path(folder, "broken"))
-        alone = tuple(stage for stage in stages if stage == OWN) if args.together > 1 else stages
+        alone = tuple(stage for stage in stages if _is_own(stage)) if args.together > 1 else stages
         for number in sorted(only):
             if by := _caught_by(mutants[number], whole, broken, alone, args.limit):
                 caught[number] = by

@@ -7,6 +7,9 @@ One thread; in each round, in turns: ``shmmap::ndt_leaves`` of the mapped ``ndt`
 PCL's voxel grid of their points (processor time); a whole request to ``NdtLeaves`` and to ``PcdLoader``, all
 cells, until it is answered, beside PCL reading the same cells' files, which are in the page cache (elapsed).
 Limit: 0.5 ms for the leaves.  Needs g++ and libpcl-dev.
+
+Measured beside those of BENCHMARKS.md: a request of Autoware's scan matcher for all 59 cells, none held,
+takes 2.9 ms with leaves and 33 ms with points; PCL reads the points' files from the page cache in 40 ms.
 """
 
 from __future__ import annotations

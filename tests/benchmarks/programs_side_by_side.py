@@ -29,8 +29,6 @@ from shmmap_clients.scans.trajectory import tum_line
 from shmmap.demo.program import Program
 from shmmap.errors import InternalError
 
-__all__ = ["ProgramRun", "ThreePrograms", "run_three_programs", "table"]
-
 _IN_FLIGHT: Final = 6  # scans
 _ANSWER_S: Final = 120.0  # for an answer
 _LAST_RUN_S: Final = 900.0  # for a program's end: the elevation map may just have begun a large map

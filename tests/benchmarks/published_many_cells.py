@@ -11,9 +11,8 @@ local       a daemon of a local map of 10 000 cells, whose list is in the cache,
 published   a daemon that never saw the published map, with an empty disk, until it is ready
 
 Then, of the latter: from when it is ready until all cells are known to a client that connects, within 200 m
-of a place where four parts of the list meet, far from the middle of the map, where the daemon begins to fetch
-the rest of the list; and the daemon's memory then, without its loaders.  While it runs on, it fetches more of
-the list, as far as `--catalogue-budget` (256 MiB) allows: what it has after a minute is printed, too.
+of a place where four parts of the list meet; and the daemon's memory then, without its loaders.  While it
+runs on without a client, it fetches no more of the list: what it has after a minute is printed, too.
 
 Limits: ready at most 0.6 s after the local one, cells known in 0.6 s, 100 MB; the least of the rounds.
 """

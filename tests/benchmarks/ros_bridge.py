@@ -8,6 +8,9 @@ process that answers each request of the same service type with bytes that it ha
 the bridge's reply. The client of both does not look into the replies. Rounds of both alternate in one run;
 compare the ratios. Then the same cells as handles, by the Python client of shmmap, which attaches them each
 time. With ``--clients`` that many participants come, ask once and leave: what the bridge has more afterwards.
+
+Measured beside those of BENCHMARKS.md: the same cells as handles, attached in Python, 0.35 to 0.7 ms and 9
+to 10 ms; after 1000 clients, one after another, 2.9 MiB more, no thread and no descriptor.
 """
 
 from __future__ import annotations
@@ -39,7 +42,7 @@ import struct, sys
 from cyclonedds.core import WaitSet
 from cyclonedds.util import duration
 from shmmap_clients.ros_bridge.cdr import CdrWriter
-from shmmap_clients.ros_bridge.messages import PARTIAL
+from shmmap_clients.ros_bridge.messages import PARTIAL, ready_made
 from shmmap_clients.ros_bridge.participant import open_participant
 from shmmap_clients.ros_bridge.service_server import ServiceServer
 
@@ -77,7 +80,7 @@ while True:
             reply = of_size(size)
             replies[size] = reply
         reply[4:20] = struct.pack("<Qq", message.client, message.number)
-        why = server.reply(reply)
+        why = server.reply(ready_made(PARTIAL.reply, reply))
         assert not why, why
 """
 
@@ -171,14 +174,14 @@ def measure(arguments: argparse.Namespace, daemon: DaemonProcess, bridge: Bridge
                         f"  {np.median(middle[what] / middle['echo']):.3f} x echo (median of paired blocks)"
                     )
             if arguments.clients:
-                bridge.wait_status(remembered=0)
+                bridge.wait_status(clients=0)
                 before = resources(bridge.pid)
                 started = time.perf_counter()
                 for _ in range(arguments.clients):
                     with peer.another() as one:
                         one.client(SERVICE, PARTIAL).call(area=AreaInfo(10.0, 10.0, 1.0))
                 took = time.perf_counter() - started
-                bridge.wait_status(clients=1, remembered=0)
+                bridge.wait_status(clients=1)
                 print(
                     f"{arguments.clients} clients one after another in {took:.0f} s; the bridge had {before}"
                 )

@@ -12,7 +12,11 @@ that has the vehicle's poses, one that has its route, too.
 
 With ``--bucket`` the map is published to an S3 server (moto), which the daemon reaches over a link on which
 each answer takes such a time (another one each time), and nothing passes while it is out
-(`tests.support.slow_link`).  One loader, which fetches 32 objects at once.
+(`tests.support.slow_link`).  One loader, which fetches 32 objects at once.  Measured so: with its route all
+queries lack nothing, with its poses 98.2 %, with 12 late cells, none of them in an outage.
+
+Single cold cells asked for beside wait 2.3 s (99th percentile) with a route, 2.1 s with poses, 7.1 s where
+nothing is fetched ahead, because there the vehicle's own cells are what they wait behind.
 
 Late is a cell that is not in the first answer to the request that needs it; the first 30 s do not count.
 Limits: with the route none is late, without it 97 % of requests (98 % with ``--bucket``) find all in memory;

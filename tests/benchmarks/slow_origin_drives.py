@@ -15,19 +15,6 @@ from shmmap.origin.catalogue import Catalogue
 from shmmap.segment.layout import SourceStamp
 from shmmap.simulation.town import drive as town_path
 
-__all__ = [
-    "CELL_M",
-    "Drive",
-    "city_drive",
-    "city_path",
-    "dense_catalogue",
-    "recorded_drive",
-    "rounded",
-    "square_drive",
-    "town_drive",
-    "travelled_m",
-]
-
 CELL_M = 20.0
 KITTI_S = 0.1  # between two poses of KITTI's odometry data
 _HEADINGS = ((1, 0), (0, 1), (-1, 0), (0, -1))

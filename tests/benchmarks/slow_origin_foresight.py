@@ -14,8 +14,6 @@ from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.travel.motion import Motion
 from shmmap.geometry import Circle
 
-__all__ = ["Margin", "Nothing", "Policy", "Truth"]
-
 IsAbsent = Callable[[int, str], bool]
 MARGIN_M = 60.0
 
@@ -39,6 +37,9 @@ class Nothing:
         """When to ask again though nothing happens: never."""
         del now_s
         return math.inf
+
+    def note_origin(self, now_s: float) -> None:
+        """Note whether the origin is out: nothing depends on it."""
 
 
 class Margin(Nothing):
@@ -117,6 +118,10 @@ class Policy(Nothing):
         self._prefetch = Prefetch(is_absent, outage_tolerance_s, self.health)
         self._motion = motion
         self.asks(area)
+
+    def note_origin(self, now_s: float) -> None:
+        """As the daemon does when loads end."""
+        self._prefetch.note_origin(now_s)
 
     def asks(self, area: Circle) -> None:
         """Go on from there."""

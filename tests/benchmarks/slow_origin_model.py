@@ -25,6 +25,15 @@ class Outages(NamedTuple):
         """Share of time in which loads succeed."""
         return 1.0 - self.length_s / self.period_s
 
+    def next_s(self, now_s: float) -> float:
+        """Return when the present outage began, or the next one begins; infinity if there are none."""
+        if not self.length_s:
+            return math.inf
+        last_s = self.first_s + math.floor((now_s - self.first_s) / self.period_s) * self.period_s
+        if now_s < self.first_s:
+            return self.first_s
+        return last_s if now_s < last_s + self.length_s else last_s + self.period_s
+
     def meets(self, begin_s: float, end_s: float) -> bool:
         """Whether an outage falls into this time, both ends included."""
         if not self.length_s:
@@ -69,6 +78,64 @@ class SlowOrigin:
         """Begin a load: when it ends, and whether it fails."""
         end_s = now_s + self.took_s()
         return end_s, self.outages.meets(now_s, end_s)
+
+
+SILENCE_S = 4.0
+"""Silence after which a load over a link fails: a server that is silent for 2 s is asked once more."""
+
+
+@dataclass(eq=False, slots=True)
+class ThinLink:
+    """A link that carries one object after the other, in the order in which they were asked for.
+
+    Attributes
+    ----------
+    mbit_s, delay_s
+        Its rate, 10^6 bits a second, and the time until an answer begins if nothing is before it.
+    object_bytes
+        Bytes of each object.
+    outages
+        Nothing passes in one; an object that waits in one for longer than `SILENCE_S` fails, and is lost.
+    """
+
+    mbit_s: float
+    delay_s: float
+    object_bytes: int
+    outages: Outages
+    carried_bytes: float = 0.0
+    _free_s: float = 0.0
+    _on_it: list[tuple[float, float]] = field(default_factory=list)
+    _taken_s: float = 0.0
+
+    @property
+    def object_s(self) -> float:
+        """Time that an object takes."""
+        return self.object_bytes * 8e-6 / self.mbit_s
+
+    def load(self, now_s: float) -> tuple[float, bool]:
+        """Ask for an object: when that ends, and whether it fails."""
+        begin_s = max(self._free_s, now_s + self.delay_s)
+        end_s, out_s = begin_s + self.object_s, self.outages.next_s(now_s)
+        if out_s < end_s:
+            back_s = out_s + self.outages.length_s
+            since_s = max(now_s, out_s)
+            if back_s > since_s + SILENCE_S:
+                return since_s + SILENCE_S, True
+            begin_s = max(begin_s, back_s)
+            end_s = begin_s + self.object_s
+        self._free_s = end_s
+        self._on_it.append((begin_s, end_s))
+        return end_s, False
+
+    def take_bytes(self, now_s: float) -> int:
+        """Return the bytes that have come since the last call."""
+        share = 0.0
+        for begin_s, end_s in self._on_it:
+            share += max(0.0, min(end_s, now_s) - max(begin_s, self._taken_s)) / (end_s - begin_s)
+        self._on_it = [one for one in self._on_it if one[1] > now_s]
+        self._taken_s = now_s
+        self.carried_bytes += share * self.object_bytes
+        return round(share * self.object_bytes)
 
 
 @dataclass(slots=True)

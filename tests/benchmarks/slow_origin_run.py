@@ -16,8 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from shmmap.daemon.loading.link import Link
 from shmmap.daemon.loading.loads import FIRST_RETRY_S, LAST_RETRY_S
 from shmmap.daemon.loading.look_ahead import URGENT_S
+from shmmap.daemon.map.arrivals import Arrivals
 from shmmap.daemon.travel.motion import Motion
 from shmmap.daemon.travel.places import places_of, until_needed
 from shmmap.geometry import Circle
@@ -25,9 +27,7 @@ from shmmap.origin.catalogue import Catalogue
 from shmmap.protocol.messages import Intent
 from tests.benchmarks.slow_origin_drives import Drive
 from tests.benchmarks.slow_origin_foresight import Margin, Nothing, Policy, Truth
-from tests.benchmarks.slow_origin_model import Counts, Query, SlowOrigin
-
-__all__ = ["ROWS", "Setting", "simulate"]
+from tests.benchmarks.slow_origin_model import Counts, Query, SlowOrigin, ThinLink
 
 ROWS = ("none", "margin", "no route", "trajectory", "route", "oracle")
 """What is fetched ahead: nothing; 60 m more; along the motion learnt from poses; along 150 m of path, sent
@@ -39,6 +39,10 @@ FULL_S = 1.0
 """So long nothing is fetched ahead after there was no room for it."""
 EVICTED_AT_A_TIME = 32
 """Cells that are evicted at a time."""
+POLL_S = 0.5
+"""How long after an outage the origin is found to answer again, on average."""
+TICK_S = 0.05
+"""Interval at which bytes are reported while they come."""
 LONGEST_WARM_UP_S = 120.0
 WARM_UP_S = 30.0
 """Of rows that do not look ahead."""
@@ -56,6 +60,8 @@ class Setting:
         Cells that fit into memory.
     share
         Part of them that may be there without having been asked for.
+    budget
+        Whether the link has one; else as much is under way as there are loaders.
     """
 
     row: str
@@ -65,13 +71,19 @@ class Setting:
     loaders: int = 8
     memory_cells: int = 1000
     share: float = 0.5
+    budget: bool = False
 
 
 class _Simulation:
     """The state of one; see `simulate`."""
 
-    def __init__(self, drive: Drive, catalogue: Catalogue, origin: SlowOrigin, setting: Setting) -> None:
+    def __init__(
+        self, drive: Drive, catalogue: Catalogue, origin: SlowOrigin | ThinLink, setting: Setting
+    ) -> None:
         self.drive, self.catalogue, self.origin, self.setting = drive, catalogue, origin, setting
+        self.thin = origin if isinstance(origin, ThinLink) else None
+        self.link = Link(Arrivals()) if setting.budget else None
+        self.back_s = math.inf
         count = len(catalogue)
         self.boxes = np.ascontiguousarray(catalogue.boxes)
         self.present = np.zeros(count, bool)
@@ -181,13 +193,15 @@ class _Simulation:
 
     def pump(self) -> None:
         """Give loaders something to do."""
-        while self.demands and len(self.running) < self.setting.loaders:
+        while self.demands and len(self.running) < self.setting.loaders and self.may_begin(ahead=False):
             cell = self.demands.pop()
             if self.is_absent(cell, "points"):
                 self.make_room(0.0)
                 self.begin(cell)
         self.wake_s = math.inf
-        while not self.demands and len(self.running) < self.setting.loaders:
+        if self.demands and self.link is not None and len(self.running) < self.setting.loaders:
+            self.wake_s = max(self.link.next_s(), self.now_s + 0.01)
+        while not self.demands and len(self.running) < self.setting.loaders and self.may_begin(ahead=True):
             if self.now_s < self.full_until_s:
                 self.wake_s = self.full_until_s
                 return
@@ -211,6 +225,16 @@ class _Simulation:
             else:
                 self.begin(wish.cell)
 
+    def may_begin(self, *, ahead: bool) -> bool:
+        """Whether the link has room."""
+        return self.link is None or self.link.may_begin(self.now_s, ahead=ahead)
+
+    def note_link(self) -> None:
+        """Note what has come."""
+        nbytes = self.thin.take_bytes(self.now_s) if self.thin is not None else 0
+        if self.link is not None:
+            self.link.arrived(nbytes, self.now_s)
+
     def note_full(self) -> None:
         """Nothing is wished for: from now on it counts."""
         policy = self.setting.row not in ("none", "margin")
@@ -222,12 +246,22 @@ class _Simulation:
         """Load a cell."""
         end_s, failed = self.origin.load(self.now_s)
         self.loading[cell] = True
+        if self.link is not None:
+            ahead = cell not in self.inside
+            nbytes = self.thin.object_bytes if self.thin is not None else 0
+            self.link.begin(cell, nbytes, self.now_s, "ahead" if ahead else "demand")
         heapq.heappush(self.running, (end_s, cell, self.now_s, failed))
 
     def end(self) -> None:
         """The load that ends first has ended."""
         _, cell, began_s, failed = heapq.heappop(self.running)
         self.loading[cell] = False
+        if self.link is not None:
+            self.link.end(cell, 0 if failed or self.thin is None else self.thin.object_bytes)
+        if failed and self.thin is not None:  # what polls the origin finds out that it is back
+            outages = self.thin.outages
+            self.back_s = outages.next_s(began_s) + outages.length_s + POLL_S
+            self.foresight.health.unreachable = self.back_s > self.now_s
         if failed:
             delay_s = min(2.0 * self.delay_s[cell], LAST_RETRY_S) or FIRST_RETRY_S
             self.delay_s[cell], self.retry_s[cell] = delay_s, self.now_s + delay_s
@@ -244,6 +278,7 @@ class _Simulation:
             self.counts.used += waited_for
             self.unused += not waited_for
             self.close()
+        self.foresight.note_origin(self.now_s)
         if self.foresight.health.ended(self.now_s - began_s, failed=failed):
             self.delay_s[:] = self.retry_s[:] = 0.0
             self.ask_again()
@@ -271,10 +306,19 @@ class _Simulation:
         while True:
             ask_s = self.asked_s[ask_at] if ask_at < len(self.asked_s) else math.inf
             end_s = self.running[0][0] if self.running else math.inf
-            self.now_s = min(ask_s, send_s, end_s, self.wake_s if self.wake_s > self.now_s else math.inf)
+            wake_s = self.wake_s if self.wake_s > self.now_s else math.inf
+            tick_s = self.now_s + TICK_S if self.running and self.link is not None else math.inf
+            self.now_s = min(ask_s, send_s, end_s, wake_s, self.back_s, tick_s)
             if self.now_s >= self.drive.length_s:
                 break
-            if self.now_s == end_s:
+            self.note_link()
+            if self.now_s == self.back_s:
+                self.back_s = math.inf
+                self.foresight.health.unreachable = False
+                self.foresight.health.answers()
+                self.delay_s[:] = self.retry_s[:] = 0.0
+                self.ask_again()
+            elif self.now_s == end_s:
                 self.end()
             elif self.now_s == ask_s:
                 ask_at += 1
@@ -290,6 +334,6 @@ class _Simulation:
         return self.counts
 
 
-def simulate(drive: Drive, catalogue: Catalogue, origin: SlowOrigin, setting: Setting) -> Counts:
+def simulate(drive: Drive, catalogue: Catalogue, origin: SlowOrigin | ThinLink, setting: Setting) -> Counts:
     """Drive once, and count."""
     return _Simulation(drive, catalogue, origin, setting).run()

@@ -36,8 +36,6 @@ from shmmap.statistics.reader import read_statistics
 from tests.support.daemon_process import ROOT, DaemonProcess
 from tests.support.divided_map import DividedMap, make_map, random_points
 
-__all__ = ["main"]
-
 CELLS = 20
 POINTS = 8000
 BUDGET = 24 << 20

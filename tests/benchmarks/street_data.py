@@ -1,8 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """The street that benchmarks of localization drive along: its map, scans and poses.
 
-``SHMMAP_TEST_DATA`` names the directory: of recorded data (BENCHMARKS.md says what that is and where it
-comes from), or of generated data, which ``python -m tests.benchmarks.make_data DIRECTORY`` makes.
+``SHMMAP_TEST_DATA`` names the directory: of generated data, which ``python -m tests.benchmarks.make_data
+DIRECTORY`` makes, or of recorded data (BENCHMARKS.md says where that comes from), which is used if both are
+there:
+
+    kitti0005_map/map_static_v005.pcd            the map without moving objects, one point per 5 cm
+    kitti0005_map/map_static_v010.pcd            the same, one point per 10 cm
+    kitti0005_scans/scan_0001.npz ...            scans that are not in the map, by frame: xyz in metres, or
+                                                 xyz_4mm in units of 4 mm
+    kitti0005_scans/poses_heldout_tum.txt        pose of each scan (TUM: t x y z qx qy qz qw)
+    kitti0005_scans/poses_all_tum.txt            pose of each frame
+    ndt/target_ds0.1_points.npz, source_ds0.1_points.npz
+                                                 two scans, one point per 10 cm (pcl::VoxelGrid), array xyz
+
+The map has the even frames of the drive, the scans are odd ones.  Their poses came from registering the
+frames with GICP (small_gicp): each to the model of those before, then three rounds of the even frames against
+the odd ones' model and back.
 """
 
 from __future__ import annotations
@@ -15,8 +29,6 @@ import numpy as np
 from numpy.typing import NDArray
 from shmmap_clients.scans.scan_file import read_scan
 from shmmap_clients.scans.trajectory import read_trajectory
-
-__all__ = ["SENSOR_HEIGHT_M", "TILE_M", "Street", "data_dir", "sampled", "street"]
 
 SENSOR_HEIGHT_M = 1.73  # above the ground, of KITTI's scanner and of the simulated one
 TILE_M = 220.0  # both maps fit into a square of this side; copies of them are laid out at this distance

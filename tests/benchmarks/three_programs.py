@@ -8,6 +8,11 @@ memory, and what was lost or left.  A machine of two cores shows mostly how they
 
     SHMMAP_TEST_DATA=DIR python -m tests.benchmarks.three_programs [--minutes 4] [--tiles 4]
         [--budget-mib 300] [--out DIR]
+
+Measured with ``--tiles 10 --minutes 10 --budget-mib 600``: `shmmap-ndt` 12.7 ms (median), 172.7 ms (99th
+percentile: jumps to another tile, whose map is loaded first), 120 MiB of its own, 1.3 MiB more in the last
+third; `shmmap-compare` 12.1 and 29.1 ms, 192 MiB, 39.6 MiB less; `shmmap-elevation`, five times the whole
+map, 144 MiB, 6.2 MiB less.
 """
 
 from __future__ import annotations
@@ -32,8 +37,6 @@ from tests.benchmarks.programs_side_by_side import ThreePrograms, run_three_prog
 from tests.benchmarks.street_data import TILE_M, street
 from tests.benchmarks.tile_map import tile_map
 from tests.support.daemon_process import DaemonProcess
-
-__all__ = ["main"]
 
 SCAN_S = 0.5
 

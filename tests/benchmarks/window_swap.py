@@ -24,8 +24,6 @@ import shmmap
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import make_map
 
-__all__ = ["main"]
-
 
 def loop(window: shmmap.MapWindow, poses: list[float], seconds: float, rate: float) -> list[int]:
     """Run the control loop, the pose jumping to the next one every 0.25 s; nanoseconds of each turn."""

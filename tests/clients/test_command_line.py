@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import importlib.util
 import json
 import os
 import re
@@ -48,6 +49,13 @@ def test_a_file_that_cannot_be_written_is_refused_at_once(tmp_path: Path) -> Non
         with pytest.raises(CannotWrite):
             write_text(tmp_path / name, "text")
     assert output_file("new.svg") == Path("new.svg"), "the working directory"
+
+
+def test_a_mapper_is_named_as_other_programs_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The option is known: only the scans are missing."""
+    words = ["run", "--live", "lidar", "--scans", str(tmp_path / "none"), "--name", "front"]
+    assert rolling(words) != 2
+    assert "unrecognized" not in capsys.readouterr().err
 
 
 def test_an_output_that_cannot_be_written_is_one_line(
@@ -272,3 +280,27 @@ def test_a_missing_package_is_one_clear_line(package: str, tmp_path: Path) -> No
     asked = subprocess.run([sys.executable, "-c", code, "--help"], capture_output=True, text=True)
     assert asked.returncode == 0, "the help needs no package"
     assert asked.stdout.startswith("usage: ")
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        ([], 2, "give --scans DIR, BAG or ENDPOINT, or --topic TOPIC"),
+        (["--scans", ".", "--publish-tf"], 2, "--publish-tf and --ros-args are for --topic"),
+        (["--scans", ".", "--ros-args", "-r", "a:=b"], 2, "--publish-tf and --ros-args are for --topic"),
+        (["--topic", "/points", "--truth", "poses.txt"], 2, "--truth is for --scans"),
+    ],
+)
+def test_scans_of_a_running_system(
+    words: list[str], code: int, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert ndt(["follow", *words]) == code
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.skipif(importlib.util.find_spec("rclpy") is not None, reason="ROS 2 is here")
+def test_a_running_system_without_ros(capsys: pytest.CaptureFixture[str]) -> None:
+    assert ndt(["follow", "--topic", "/points"]) == 69
+    error = capsys.readouterr().err
+    assert "--topic without --scans needs " in error
+    assert "source ROS 2 first" in error

@@ -39,7 +39,8 @@ def poses(tmp_path: Path) -> str:
 
 def options(scans: str, **other: Any) -> argparse.Namespace:
     given = {"scans": scans, "quiet": False, "allow_empty": False, "json_lines": None, "bin_columns": None}
-    return argparse.Namespace(**{**given, "min_range": 0.5, **other})
+    bag = {"topic": None, "base_frame": "base_link"}
+    return argparse.Namespace(**{**given, **bag, "min_range": 0.5, **other})
 
 
 class Report:
@@ -75,9 +76,9 @@ def test_each_scan_is_written_and_said_in_order(
     args, report = options(scans, json_lines=f"{tmp_path}/lines"), Report()
     with ExitStack() as stack:
         drive = ScanDrive(args, "program", poses, stack)
-        first = drive.first()
-        assert first is not None
-        assert (first.name, seen) == ("s_0", [])
+        for count in (1, 2):
+            assert [scan.name for scan in drive.ahead(count)] == ["s_0", "s_1"][:count]
+        assert seen == []
         drive.run(step, report, document)
     assert seen == [(f"s_{number}", 0.5 * number, number) for number in range(12)]
     assert report.points == 78
@@ -136,7 +137,7 @@ def test_no_scan_is_a_negative_answer(tmp_path: Path, capsys: pytest.CaptureFixt
         with ScanPublisher(endpoint) as publisher:
             assert publisher.wait_for_subscriber(30.0)
             publisher.send(None)
-            assert drive.first() is None
+            assert drive.ahead(1) == []
         drive.run(size, Report())
         assert drive.no_scans() == 1
     assert capsys.readouterr().err == f"program: no scan came from {endpoint}\n"

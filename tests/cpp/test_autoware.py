@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import math
 import os
+import re
 import signal
 import subprocess
 import zlib
@@ -53,9 +55,34 @@ def of(answer: list[list[str]], kind: str) -> list[list[str]]:
     return [line[1:] for line in answer if line[0] == kind]
 
 
+def plain(name: str) -> str:
+    """Return the cell id of a name that carries a version."""
+    cell_id, version = re.fullmatch(r"(.*)@([0-9a-f]{16})", name, re.DOTALL).groups()  # type: ignore[union-attr]
+    assert version != "0" * 16
+    return str(cell_id)
+
+
 def names(answer: list[list[str]], kind: str) -> list[str]:
-    """Base names of the ids on the lines of a kind."""
-    return [Path(line[0]).name for line in of(answer, kind)]
+    """Base names of the cells on the lines of a kind."""
+    return [Path(plain(line[0])).name for line in of(answer, kind)]
+
+
+def crc_of(path: Path) -> str:
+    """Checksum of the points of a PCD file."""
+    return str(zlib.crc32(data_of(path)))
+
+
+def versions(one: DaemonProcess) -> dict[str, int]:
+    """Present version of each cell, as another client sees it."""
+    with shmmap.connect(one.endpoint) as python:
+        return {cell.id: cell.version for cell in python.metadata()}
+
+
+def change(one: DaemonProcess, made: DividedMap, name: str, seed: int) -> None:
+    """Give a cell other points, and have the daemon notice."""
+    made.change(name, seed=seed)
+    with shmmap.connect(one.endpoint) as python:
+        python.reload()
 
 
 def data_of(path: Path) -> bytes:
@@ -84,12 +111,14 @@ def test_cells_are_those_of_autoware_s_loader(
     assert answer[0] == ["header", "map", "0", "0"]
     wanted = divided_map.in_square(5, 5, 30)
     assert len(wanted) == 16
+    version = versions(one)
     expected = []
     for name in wanted:
         x0, y0, x1, y1 = (f"{side:g}" for side in divided_map.box(name))
         crc = zlib.crc32(data_of(divided_map.pcd_dir / name))
         layout = "1 500 16 8000 01"
-        expected.append([divided_map.id(name), f"{x0} {y0} {x1} {y1}", layout, FIELDS, str(crc)])
+        named = f"{divided_map.id(name)}@{version[divided_map.id(name)]:016x}"
+        expected.append([named, f"{x0} {y0} {x1} {y1}", layout, FIELDS, str(crc)])
     assert of(answer, "cell") == expected
     assert of(answer, "remove") == []
 
@@ -109,7 +138,7 @@ def test_fields_of_every_kind(daemon: DaemonFactory, node: AutowareNode, tmp_pat
     assert small[2:4] == ["1 1 12 12 01", "x:0:7:1 y:4:7:1 z:8:7:1 "]
     with shmmap.connect(one.endpoint) as python:
         cells = {cell.id: cell for cell in python.around(0, 0, radius=500).raise_for_failures()}
-    record = record_of(cells[large[0]])
+    record = record_of(cells[plain(large[0])])
     assert record.dtype.names is not None
     kept = [name for name in record.dtype.names if name != "long"]
     packed = np.zeros(3000, [(name, record.dtype[name]) for name in kept])
@@ -128,7 +157,9 @@ def test_real_maps_too(daemon: DaemonFactory, node: AutowareNode, data_dir: Path
     answer = of(node.ask("update", 0, 0, 1e6), "cell")
     with shmmap.connect(one.endpoint) as python:
         cells = python.around(0.0, 0.0, radius=1e6, wait=120.0).raise_for_failures()
-        expected = [[cell.id, str(zlib.crc32(record_of(cell).tobytes()))] for cell in cells]
+        expected = [
+            [f"{cell.id}@{cell.version:016x}", str(zlib.crc32(record_of(cell).tobytes()))] for cell in cells
+        ]
     assert [[line[0], line[4]] for line in answer] == expected
     assert sum(len(cell.xyz) for cell in cells) > 1e6
 
@@ -150,43 +181,195 @@ def test_along_a_drive_the_node_holds_what_autoware_s_area_has(
         assert sorted(held) == sorted(divided_map.in_square(x, 3, 25))
 
 
-def test_a_changed_cell_comes_again(
-    daemon: DaemonFactory, node: AutowareNode, divided_map: DividedMap
+def test_a_changed_cell_comes_under_a_new_name(
+    daemon: DaemonFactory, node: AutowareNode, node_program: Path, divided_map: DividedMap
 ) -> None:
-    """Under its id, which is not removed: Autoware adds first and removes after."""
+    """Once to each requester, over restarts; one that keeps the first of an id gets it, too."""
     one = daemon(divided_map.root)
-    node.ask("loader", one.endpoint, 60, 5)
-    before = {line[0]: line[4] for line in of(node.ask("update", *EVERYTHING), "cell")}
-    divided_map.change("0_0.pcd", seed=7)
-    with shmmap.connect(one.endpoint) as python:
-        python.reload()
-    ((kind, *_), cell) = node.ask("update", *EVERYTHING)
-    assert kind == "header"
-    assert cell[1] == divided_map.id("0_0.pcd")
-    assert cell[5] == str(zlib.crc32(data_of(divided_map.pcd_dir / "0_0.pcd"))) != before[cell[1]]
-    assert node.ask("update", *EVERYTHING) == [["header", "map", "0", "0"]]
+    node.ask("loader", one.endpoint, 60, 30)
+    other = AutowareNode(node_program)
+    other.ask("loader", one.endpoint, 60, 30)
+    cell_id = divided_map.id("0_0.pcd")
+    old = f"{cell_id}@{versions(one)[cell_id]:016x}"
+    for requester in (node, other):
+        assert len(of(requester.ask("update", *EVERYTHING), "cell")) == 36
+    change(one, divided_map, "0_0.pcd", seed=7)
+    new = f"{cell_id}@{versions(one)[cell_id]:016x}"
+    assert new != old
+    answer = node.ask("update", *EVERYTHING)
+    assert [line[0] for line in of(answer, "cell")] == [new]
+    assert of(answer, "remove") == [[old]]
+    one.stop()
+    one.start()
+    other.ask("loader", one.endpoint, 60, 30)
+    assert other.ask("update", *EVERYTHING) == answer
+    for requester in (node, other):
+        assert requester.ask("update", *EVERYTHING) == [["header", "map", "0", "0"]]
+        held = dict(requester.ask("held"))
+        assert len(held) == 36
+        assert held[new] == crc_of(divided_map.pcd_dir / "0_0.pcd")
+    change(one, divided_map, "0_0.pcd", seed=8)
+    assert names(other.ask("update", *EVERYTHING), "cell") == ["0_0.pcd"]
+    assert other.close() == 0
 
 
-def test_ids_that_were_not_handed_out_here(
+def test_ids_that_were_not_handed_out(
     daemon: DaemonFactory, node: AutowareNode, divided_map: DividedMap
 ) -> None:
-    """Those of the area come again, as what they name is unknown; the others are removed, each once."""
+    """Plain ids are outdated: what they name comes under its name. All are removed, each once."""
     one = daemon(divided_map.root)
     node.ask("loader", one.endpoint, 60, 5)
     inside, outside = divided_map.id("0_0.pcd"), divided_map.id("-60_-60.pcd")
-    held = ["unknown.pcd", outside, inside, "/nowhere/0_0.pcd", "unknown.pcd", "40_40.pcd", inside]
+    version = versions(one)
+    right, wrong = f"{inside}@{version[inside]:016x}", f"{inside}@{version[outside]:016x}"
+    foreign = ["unknown.pcd", outside, f"{outside}@{version[outside]:016x}", inside, "/nowhere/0_0.pcd"]
+    foreign += [f"/nowhere/0_0.pcd@{7:016x}", "40_40.pcd", f"0_0.pcd@{version[inside]:016x}", "@", wrong]
+    foreign += [right.upper(), right[:-1], f"{right}0", f"{inside}@{version[inside]:016X}"]
+    held = [foreign[0], *foreign, inside]
     answer = node.ask("ask", 10, 10, 0, ";".join(held))
-    assert [line[0] for line in of(answer, "cell")] == [inside]
-    assert [line[0] for line in of(answer, "remove")] == [
-        "unknown.pcd",
-        outside,
-        "/nowhere/0_0.pcd",
-        "40_40.pcd",
-    ]
-    # now it was handed out here
-    answer = node.ask("ask", 10, 10, 0, ";".join(held))
+    assert [line[0] for line in of(answer, "cell")] == [right]
+    assert [line[0] for line in of(answer, "remove")] == list(dict.fromkeys(held))
+    answer = node.ask("ask", 10, 10, 0, ";".join([*held, right, right]))
     assert of(answer, "cell") == []
-    assert inside not in [line[0] for line in of(answer, "remove")]
+    assert [line[0] for line in of(answer, "remove")] == list(dict.fromkeys(held))
+
+
+def test_ids_without_versions(daemon: DaemonFactory, node: AutowareNode, divided_map: DividedMap) -> None:
+    """As from Autoware's loader: a plain id is current whatever its file is, and the only one."""
+    one = daemon(divided_map.root)
+    node.ask("loader", one.endpoint, 60, 5, 10**9, "plain")
+    answer = node.ask("update", *EVERYTHING)
+    assert [line[0] for line in of(answer, "cell")] == sorted(map(divided_map.id, divided_map.corners))
+    assert {line[0] for line in node.ask("grids", *EVERYTHING)} == {"grid"}
+    change(one, divided_map, "0_0.pcd", seed=7)
+    assert node.ask("update", *EVERYTHING) == [["header", "map", "0", "0"]]
+    assert len(of(node.ask("update", 0, 0, 0), "remove")) == 32
+    named = f"{divided_map.id('0_0.pcd')}@{versions(one)[divided_map.id('0_0.pcd')]:016x}"
+    answer = node.ask("ask", 10, 10, 0, named)
+    assert [line[0] for line in of(answer, "cell")] == [divided_map.id("0_0.pcd")]
+    assert of(answer, "remove") == [[named]]
+
+
+def test_names_of_cells(node: AutowareNode) -> None:
+    """They are split at the last ``@`` before 16 digits, and at no other."""
+    for cell_id in ("/a.pcd", "/a@b/c@.pcd", "/a@0123456789abcdef", "/a b@0123456789abcdef@0.pcd"):
+        for version in (1, 0x1234ABC, 2**63 + 5, 2**64 - 1):
+            name = f"{cell_id}@{version:016x}"
+            assert node.ask("name", cell_id, version) == [[name]]
+            assert node.ask("split", name) == [[cell_id, str(version)]]
+    for text in (
+        "/a.pcd",
+        "/a@0123456789ABCDEF",
+        "/a@123456789abcdef",
+        "/a@00123456789abcdef",
+        "/0123456789abcdef",
+    ):
+        assert node.ask("split", text) == [[text, "none"]]
+
+
+def test_paths_that_look_like_names(daemon: DaemonFactory, node: AutowareNode, tmp_path: Path) -> None:
+    """A path may hold ``@``, and what looks like a version."""
+    made = make_map(tmp_path / "a@b" / f"map@{5:016x}", columns=2, rows=1)
+    made.write_cell(f"0_0@{7:016x}.pcd", (20, 0), made.points("0_0.pcd"))
+    made.write_metadata()
+    one = daemon(made.root)
+    node.ask("loader", one.endpoint, 60, 5)
+    answer = node.ask("update", *EVERYTHING)
+    assert [plain(line[0]) for line in of(answer, "cell")] == sorted(map(made.id, made.corners))
+    assert node.ask("update", *EVERYTHING) == [["header", "map", "0", "0"]]
+    change(one, made, f"0_0@{7:016x}.pcd", seed=4)
+    answer = node.ask("update", *EVERYTHING)
+    assert names(answer, "cell") == names(answer, "remove") == [f"0_0@{7:016x}.pcd"]
+    assert of(answer, "cell")[0][0] != of(answer, "remove")[0][0]
+
+
+def test_more_than_an_answer_can_have(
+    daemon: DaemonFactory, node: AutowareNode, divided_map: DividedMap
+) -> None:
+    """The nearest cells come, and an error; the next answers bring the others, and remove none."""
+    one = daemon(divided_map.root)
+    node.ask("loader", one.endpoint, 60, 30, 10 * 8000 + 100)
+    held: list[str] = []
+    while True:
+        answer = node.ask("update", 5, 7, 500)
+        cells = names(answer, "cell")
+        assert names(answer, "remove") == []
+        if not of(answer, "log"):
+            break
+        ((message,),) = of(answer, "log")
+        assert len(cells) == 10
+        assert f"lacks {36 - len(held) - 10} cells of the area" in message
+        held += cells
+        assert set(held) == set(nearest(divided_map, 5, 7, len(held)))
+    assert len(held) == 30
+    assert sorted(held + cells) == sorted(divided_map.corners)
+    change(one, divided_map, "0_0.pcd", seed=3)
+    answer = node.ask("update", 5, 7, 500)
+    assert names(answer, "cell") == names(answer, "remove") == ["0_0.pcd"]
+    # not one fits: what the node has stays
+    node.ask("loader", one.endpoint, 60, 30, 5000)
+    divided_map.change("20_0.pcd", seed=3)
+    change(one, divided_map, "0_0.pcd", seed=4)
+    logged, nothing = node.ask("update", 5, 7, 500)
+    assert "lacks 2 cells" in logged[1]
+    assert nothing == ["nullptr"]
+
+
+def nearest(made: DividedMap, x: float, y: float, count: int) -> list[str]:
+    """Names of the cells nearest to a place; the map's places are chosen so that no two are as near."""
+
+    def distance(name: str) -> float:
+        x0, y0, x1, y1 = made.box(name)
+        return math.hypot(max(x0 - x, x - x1, 0), max(y0 - y, y - y1, 0))
+
+    return sorted(made.corners, key=distance)[:count]
+
+
+def test_more_voxels_than_an_answer_can_have(
+    daemon: DaemonFactory, node: AutowareNode, tmp_path: Path
+) -> None:
+    """A layer has versions of its own: cells that the node holds are looked at, and do not come again."""
+    one = daemon(make_map(tmp_path / "map", points=8000).root)
+    warm(one)
+    node.ask("loader", one.endpoint, 60, 30, 500_000)
+    rounds, held = 0, 0
+    while of(answer := node.ask("grids", 5, 7, 500), "log"):
+        assert 0 < len(of(answer, "grid")) < 36
+        assert of(answer, "remove") == []
+        rounds, held = rounds + 1, held + len(of(answer, "grid"))
+    assert rounds > 1
+    assert held + len(of(answer, "grid")) == 36
+    with shmmap.connect(one.endpoint) as python:
+        cells = python.around(0, 0, radius=500, layers=["ndt(leaf=2.0)"]).raise_for_failures()
+        assert node.ask("leaves") == [leaves_of(cell) for cell in cells]
+
+
+def test_more_ids_than_a_request_can_name(
+    daemon: DaemonFactory, node: AutowareNode, divided_map: DividedMap
+) -> None:
+    """A daemon takes 4 MiB: cells are found without it, and unknown ids removed."""
+    one = daemon(divided_map.root)
+    node.ask("loader", one.endpoint, 60, 30)
+    first = of(node.ask("update", 5, 5, 30), "cell")
+    unknown = [f"/nowhere/{'x' * 100}/{number}.pcd@{number + 1:016x}" for number in range(40_000)]
+    held = [line[0] for line in first[:10]]
+    answer = node.ask("ask", 5, 5, 30, ";".join(unknown + held))
+    assert of(answer, "cell") == first[10:]
+    assert [line[0] for line in of(answer, "remove")] == unknown
+
+
+def test_a_service_answers(daemon: DaemonFactory, node: AutowareNode, divided_map: DividedMap) -> None:
+    """Whatever is missing; only without a daemon there is no answer."""
+    (divided_map.pcd_dir / "0_0.pcd").write_bytes((divided_map.pcd_dir / "0_0.pcd").read_bytes()[:300])
+    one = daemon(divided_map.root)
+    node.ask("loader", one.endpoint, 0.3, 30)
+    warm(one)
+    held = ";".join(line[0] for line in of(node.ask("update", *EVERYTHING), "cell"))
+    assert [line[0] for line in node.ask("ask", *EVERYTHING, held)] == ["log", "nullptr"]
+    assert [line[0] for line in node.ask("service", *EVERYTHING, held)] == ["log", "header"]
+    assert [line[0] for line in node.ask("service", 0, 0, 0, held)][:3] == ["log", "header", "remove"]
+    one.stop()
+    assert [line[0] for line in node.ask("service", *EVERYTHING, held)] == ["log", "nullptr"]
 
 
 def test_a_node_that_restarts_receives_everything(
@@ -222,17 +405,17 @@ def test_a_daemon_that_restarts(
     one.start()
     answer = node.ask("update", *EVERYTHING)
     assert names(answer, "cell") == ["0_0.pcd", "80_80.pcd"]
-    assert names(answer, "remove") == ["20_20.pcd"]
+    assert names(answer, "remove") == ["0_0.pcd", "20_20.pcd"]
 
 
 def warm(one: DaemonProcess) -> None:
     """Have all cells in memory."""
     with shmmap.connect(one.endpoint) as python:
-        python.around(0, 0, radius=500, layers=["points", "ndt(leaf=2.0)"], wait=60).raise_for_failures()
+        python.around(0, 0, radius=500, layers=["points", "ndt(leaf=2.0)"], wait=60)
 
 
 def test_without_a_daemon(daemon: DaemonFactory, node: AutowareNode, divided_map: DividedMap) -> None:
-    """It is nullptr and a message, at the start as later; what the node holds stays known."""
+    """It is nullptr and a message, at the start as later; the node keeps what it holds."""
     one = daemon(divided_map.root)
     one.stop()
     node.ask("loader", one.endpoint, 0.2, 5)
@@ -321,10 +504,18 @@ def test_what_is_not_loaded_in_time(
     assert answer[-1] == ["nullptr"]
     (others,) = node.ask("update", 0, 0, 5)  # it holds what it held
     assert others[0] == "header"
+    # names of what is still being loaded stay: plain ids as well as old versions
+    loading = divided_map.id("20_0.pcd")
+    answer = node.ask("service", 20, 0, 15, loading)
+    assert (len(of(answer, "cell")), of(answer, "remove")) == (2, [])
+    held = node.ask("held")
+    change(one, divided_map, "0_0.pcd", seed=7)
+    answer = node.ask("service", 0, 0, 15, ";".join(line[0] for line in held))
+    assert [line[0] for line in answer] == ["log", "header"]
     os.kill(loader, signal.SIGCONT)
     warm(one)
     answer = node.ask("update", 20, 0, 15)
-    assert (len(of(answer, "cell")), len(of(answer, "remove"))) == (2, 2)
+    assert (len(of(answer, "cell")), len(of(answer, "remove"))) == (3, 3)
 
 
 def test_an_area_larger_than_the_daemon_s_memory(
@@ -338,7 +529,7 @@ def test_an_area_larger_than_the_daemon_s_memory(
     assert of(answer, "log") == []
     assert len(of(answer, "cell")) == 36
     for line in of(answer, "cell"):
-        assert line[4] == str(zlib.crc32(data_of(Path(line[0]))))
+        assert line[4] == crc_of(Path(plain(line[0])))
 
 
 def leaves_of(cell: shmmap.Cell) -> list[str]:
@@ -351,7 +542,7 @@ def leaves_of(cell: shmmap.Cell) -> list[str]:
     record["mean"] = cell["mean"]
     record["centroid"][:, :3] = cell["mean"]
     record["icov"] = cell["inverse_covariance"][:, [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
-    return [cell.id, str(len(record)), str(zlib.crc32(record.tobytes()))]
+    return [f"{cell.id}@{cell.version:016x}", str(len(record)), str(zlib.crc32(record.tobytes()))]
 
 
 def test_leaves_are_those_of_the_layer(

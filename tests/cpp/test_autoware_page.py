@@ -12,13 +12,13 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
 import shmmap
 from tests.cpp.conftest import DaemonFactory
-from tests.support.autoware_node import TYPES, compiled_with
 from tests.support.cpp_client import FLAGS
 from tests.support.daemon_process import ROOT
 from tests.support.divided_map import DividedMap
@@ -31,7 +31,7 @@ _NODE = """
 {include}
 #include <cstdio>
 #include "autoware_messages.hpp"
-#define RCLCPP_WARN(logger, ...) std::printf(__VA_ARGS__), (void)(logger)
+#define RCLCPP_ERROR(logger, ...) std::printf(__VA_ARGS__), (void)(logger)
 
 namespace rclcpp {{
 bool ok() {{ return true; }}
@@ -58,6 +58,56 @@ struct Node {{
   }}
   std::unique_ptr<MapUpdateModule> map_update_module_;
 }};
+"""
+
+_RELEASED = """
+{include}
+#include <cstdio>
+#include "autoware_messages.hpp"
+
+namespace autoware_map_msgs::srv {{
+using GetDifferentialPointCloudMap = plain::Service;
+}}
+namespace diagnostic_msgs::msg {{
+struct DiagnosticStatus {{
+  static constexpr unsigned char WARN = 1;
+}};
+}}
+struct DiagnosticsInterface {{
+  void add_key_value(const std::string &, bool) {{}}
+  void update_level_and_message(const std::int8_t level, const std::string & message)
+  {{
+    std::printf("%d %s\\n", level, message.c_str());
+  }}
+}};
+
+struct MapUpdateModule {{
+  bool update_ndt(
+    const plain::Request & wanted, std::set<std::string> & ids,
+    std::unique_ptr<DiagnosticsInterface> & diagnostics_ptr)
+  {{
+    auto request = std::make_shared<autoware_map_msgs::srv::GetDifferentialPointCloudMap::Request>(wanted);
+    request->cached_ids = {{ids.begin(), ids.end()}};
+{update}
+    std::printf("%zu %zu\\n", maps_to_add.size(), map_ids_to_remove.size());
+    for (auto & map : maps_to_add) ids.insert(map.cell_id);
+    for (const std::string & map_id_to_remove : map_ids_to_remove) ids.erase(map_id_to_remove);
+    return true;
+  }}
+{member}
+}};
+
+int main()
+{{
+  MapUpdateModule module;
+  std::set<std::string> ids;
+  auto diagnostics_ptr = std::make_unique<DiagnosticsInterface>();
+  plain::Request request;
+  for (const float radius : {{500.0F, 0.0F, -1.0F}}) {{
+    request.area.radius = radius;
+    std::printf("%d\\n", module.update_ndt(request, ids, diagnostics_ptr));
+  }}
+}}
 """
 
 _GRID = """
@@ -127,6 +177,11 @@ def check(source: str, folder: Path) -> None:
 def test_every_block_is_tested() -> None:
     assert set(PAGE.blocks) == {
         "serve",
+        "venv",
+        "launch-component",
+        "launch-core",
+        "member",
+        "update",
         "patch",
         "options",
         "proposal",
@@ -136,6 +191,61 @@ def test_every_block_is_tested() -> None:
         "pcl-cloud",
     }
     assert len(re.findall(r"^```\w+$", PAGE.text, re.MULTILINE)) == len(PAGE.blocks)
+
+
+def test_the_launch_files_name_the_node() -> None:
+    """autoware_core's line loses its package; universe's component becomes ours, or a node as core's."""
+    environment = PAGE.commands("venv")[0].split()[-1]
+    was, now = (ElementTree.fromstring(f"{line[1:]}</node>").attrib for line in PAGE.blocks["launch-core"])
+    assert [line[:5] for line in PAGE.blocks["launch-core"]] == ["-    ", "+    "]
+    script = f"{environment}/bin/shmmap-ros-node"
+    assert {**was, "exec": script} == {**now, "pkg": "autoware_map_loader"}
+    was, here = (
+        ElementTree.fromstring(f"{line[1:]}</composable_node>").attrib
+        for line in PAGE.blocks["launch-component"]
+    )
+    ours = {"pkg": "shmmap_ros", "plugin": "shmmap_ros::MapLoader"}
+    assert here == {**was, **ours} == {**ours, "name": "pointcloud_map_loader"}
+    source = (ROOT / "clients" / "ros" / "src" / "map_loader.cpp").read_text()
+    assert f"RCLCPP_COMPONENTS_REGISTER_NODE({here['plugin']})" in source
+
+
+def test_the_environment_of_the_node(tmp_path: Path) -> None:
+    """With the older numpy the client imports; ROS itself is not here."""
+    environment = PAGE.commands("venv")[0].split()[-1]
+    made = tmp_path / "environment"
+    reader = Reader(tmp_path, [Path(sys.executable).parent])
+    try:
+        user = reader.terminal(ROOT)
+        try:
+            for command in PAGE.commands("venv"):
+                user.run(command.replace(environment, str(made)).replace("install", "install -q"))
+        except AssertionError as error:
+            if re.search("No matching distribution|Could not find a version", str(error)):
+                pytest.skip("pip reaches no packages")
+            raise
+        user = reader.terminal()
+        printed = user.run(
+            f"{made}/bin/python -c 'import numpy, shmmap; print(numpy.__version__, shmmap.__file__)'"
+        )
+        version, file = printed.split()
+        assert version.startswith("1.")
+        assert file.startswith(str(made))
+        assert user.run(f"{made}/bin/shmmap version")
+    finally:
+        reader.leave()
+
+
+def test_the_lines_for_releases_run(daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path) -> None:
+    programs_or_skip("g++")
+    include, _, member = PAGE.blocks["member"]
+    source = tmp_path / "released.cpp"
+    source.write_text(_RELEASED.format(include=include, member=member, update=block("update")))
+    program = tmp_path / "released"
+    options = ["-std=c++17", "-O0", *FLAGS, f"-I{ROOT / 'tests' / 'support'}"]
+    subprocess.run(["g++", *options, str(source), "-o", str(program)], check=True)
+    one = daemon(divided_map.root)
+    assert run(program, one.endpoint) == ["36 0", "1", "0 32", "1", "1 shmmap has not got the map.", "0"]
 
 
 def test_the_lines_for_the_node_compile(tmp_path: Path) -> None:
@@ -238,30 +348,3 @@ def test_leaves_along_a_drive(daemon: DaemonFactory, divided_map: DividedMap, tm
             )
             held = wanted
     assert lines == expected
-
-
-@pytest.mark.parametrize("types", TYPES)
-def test_requesters_of_the_service(
-    daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path, types: str
-) -> None:
-    """Each gets everything once, also of requests at the same time; two of one name share what they hold."""
-    programs_or_skip("g++")
-    program = compiled_with(types, ROOT / "tests" / "support" / "requesters.cpp", tmp_path)
-    if program is None:
-        pytest.skip("ROS 2's generator of messages is missing (rosidl-generator-c-cpp, python3-rosidl)")
-    one = daemon(divided_map.root)
-    lines = run(program, one.endpoint, 0, 0, 100, 6)
-    assert lines == ["36 map 0 map "] * 6 + ["3"]
-    assert run(program, one.endpoint, 0, 0, -1, 1) == ["0 map 0 map ", "1"], "no area, nothing in it"
-    one.stop()
-    environment = {**os.environ, "SHMMAP_ENDPOINT": one.endpoint}
-    ended = subprocess.run(
-        [program, "0", "0", "100", "2", "6"], env=environment, check=True, capture_output=True, text=True
-    )
-    assert ended.stdout.splitlines() == ["none none "] * 2 + ["1"], "no daemon, no answer: never an empty one"
-    with subprocess.Popen(
-        [program, "0", "0", "100", "2"], env=environment, stdout=subprocess.PIPE, text=True
-    ) as waiting:
-        one.start()
-        assert waiting.communicate()[0].splitlines() == ["36 map 0 map "] * 2 + ["1"]
-        assert waiting.returncode == 0

@@ -15,6 +15,7 @@ import pytest
 import shmmap
 from shmmap.testing.daemon_process import without_settings
 from tests.cpp.conftest import DaemonFactory
+from tests.support.compiled_programs import made_once
 from tests.support.daemon_process import ROOT
 from tests.support.divided_map import DividedMap, make_map
 from tests.support.pages import Reader, Terminal, read_page
@@ -37,19 +38,23 @@ ament_auto_package()
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a virtual environment with the wheel of this tree and no package it depends on."""
-    where = tmp_path_factory.mktemp("installed") / ".venv"
-    subprocess.run([sys.executable, "-m", "venv", where], check=True, env=without_settings())
+    return made_once(tmp_path_factory, "installed_wheel", _install) / ".venv"
+
+
+def _install(folder: Path) -> None:
+    where = folder / ".venv"
+    environment = without_settings()
+    subprocess.run([sys.executable, "-m", "venv", where], check=True, env=environment)
     done = subprocess.run(
         [where / "bin" / "pip", "install", "-q", "--no-deps", ROOT],
         check=False,
         capture_output=True,
         text=True,
-        env=without_settings(),
+        env=environment,
     )
     if "satisfies the requirement hatchling" in done.stderr:
         pytest.skip("pip cannot reach hatchling, which builds the wheel")
     assert done.returncode == 0, done.stderr
-    return where
 
 
 @pytest.fixture
@@ -57,7 +62,7 @@ def home(tmp_path: Path) -> Path:
     """Return the directory in which the page's commands are typed, with the page's program in it."""
     path = tmp_path / "home"
     path.mkdir()
-    (path / EXAMPLE.name).write_text("\n".join(PAGE.blocks["first-cells"]) + "\n", encoding="utf-8")
+    (path / EXAMPLE.name).write_text(EXAMPLE.read_text(encoding="utf-8"), encoding="utf-8")
     return path
 
 
@@ -164,7 +169,7 @@ def check_drive(made: DividedMap, printed: str) -> None:
 def test_the_page_shows_the_window_as_it_is() -> None:
     shown = PAGE.blocks["window"]
     example = (CPP / "examples" / "window.cpp").read_text(encoding="utf-8")
-    assert "\n".join(f"  {line}" for line in shown) in example
+    assert "\n".join(f"    {line}" for line in shown) in example
 
 
 def test_part_of_a_larger_project(terminal: Terminal, home: Path, expected: str) -> None:
@@ -178,13 +183,14 @@ def test_part_of_a_larger_project(terminal: Terminal, home: Path, expected: str)
 
 
 def test_colcon(terminal: Terminal, home: Path, expected: str) -> None:
-    """Beside the page's package there is one that has the header by its `<depend>` alone."""
+    """Beside the example there is a package that has the header by its `<depend>` alone."""
     programs_or_skip("g++", "cmake", "colcon")
     if not Path("/usr/share/ament_cmake_auto").is_dir():
         pytest.skip("ament_cmake is missing")
-    manifest = "\n".join(PAGE.blocks["package-xml"])
+    package = CPP / "examples" / "ros_package"
+    manifest = (package / "package.xml").read_text(encoding="utf-8")
     by_depend = manifest.replace("first_cells", "by_depend").replace("ament_cmake<", "ament_cmake_auto<", 1)
-    lists = "\n".join(PAGE.blocks["ament-lists"])
+    lists = (package / "CMakeLists.txt").read_text(encoding="utf-8")
     for name, texts in {"first_cells": (manifest, lists), "by_depend": (by_depend, AUTO)}.items():
         (home / "src" / name).mkdir(parents=True)
         (home / "src" / name / "package.xml").write_text(texts[0], encoding="utf-8")
@@ -220,6 +226,7 @@ def test_versions_that_cmake_takes_it_for(tmp_path: Path, wanted: str, *, found:
 
 def test_every_example_is_known_to_cmake() -> None:
     lists = (CPP / "CMakeLists.txt").read_text(encoding="utf-8")
-    for path in sorted((CPP / "examples").iterdir()):
-        assert path.suffix == ".cpp"
-        assert f"  example({path.stem}" in lists, path.name
+    programs = {path.stem for path in (CPP / "examples").glob("*.cpp")}
+    assert programs | {"ros_package"} == {path.stem for path in (CPP / "examples").iterdir()}
+    for name in programs:
+        assert f"  example({name}" in lists

@@ -19,7 +19,6 @@ from tests.support.daemon_process import Deadline
 from tests.support.divided_map import DividedMap
 
 LAYERS = ("points", "ndt(leaf=2.0)")
-STATES = ("resident", "stale", "zombie")
 
 
 def rows(answer: list[list[str]], kind: str) -> list[list[str]]:
@@ -31,14 +30,10 @@ def test_everything_in_it(daemon: DaemonFactory, program: CppProgram, divided_ma
     """Of a daemon that was stopped: nothing changes between the two readers."""
     one = daemon(divided_map.root)
     with shmmap.connect(one.endpoint, name="python") as client:
-        route = [(0.0, 0.0), (60.0, 0.0)]
-        client.area(
-            shmmap.Circle(0, 0, 30), LAYERS, wait=60.0, pose=(1.5, 2.0), velocity=(5.0, 0.0), route=route
-        )
+        client.area(shmmap.Circle(0, 0, 30), LAYERS, wait=60.0)
         waiting = Deadline()
-        seen = read_statistics(one.instance, one.shm_dir)
-        while waiting(not (seen.clients and any(row.ahead for row in seen.cells))):
-            seen = read_statistics(one.instance, one.shm_dir)
+        while waiting(not read_statistics(one.instance, one.shm_dir).counters["handles_sent"]):
+            pass
         one.send(signal.SIGSTOP)
         os.waitid(os.P_PID, one.pid, os.WSTOPPED)
         answer = program.call("statistics", one.instance, one.shm_dir)
@@ -59,37 +54,6 @@ def test_everything_in_it(daemon: DaemonFactory, program: CppProgram, divided_ma
         assert tuple(map(int, counts.split())) == histogram.counts
         assert float(p99) == pytest.approx(histogram.quantile_s(0.99) or float("nan"), rel=1e-12, nan_ok=True)
     assert len(rows(answer, "histogram")) == len(python.histograms) > 0
-    cells = [
-        [
-            cell.id,
-            cell.layer,
-            cell.segment,
-            str(cell.version),
-            str(cell.bytes),
-            str(cell.points),
-            str(1 + STATES.index(cell.state)),
-            str(cell.hits),
-            " ".join(f"{side:.17g}" for side in cell.box),
-            str(int(cell.ahead)),
-        ]
-        for cell in python.cells
-    ]
-    assert sorted(rows(answer, "cell")) == sorted(cells)
-    assert len(cells) > 10
-    assert {cell.ahead for cell in python.cells} == {False, True}
-    (listed,) = python.clients
-    assert rows(answer, "client") == [
-        [
-            str(listed.session),
-            str(listed.pid),
-            str(listed.uid),
-            str(listed.cells),
-            str(listed.bytes),
-            "python",
-            listed.command,
-            "1.5",
-        ]
-    ]
 
 
 def test_how_the_daemon_is(daemon: DaemonFactory, program: CppProgram, divided_map: DividedMap) -> None:
@@ -116,14 +80,14 @@ def test_a_segment_of_which_any_byte_was_changed(
     whole = Path(one.shm_dir, f"shmmap.{one.instance}.statistics").read_bytes()
     place = tmp_path / "shmmap.other.statistics"
     refused = 0
-    for at in range(128):
+    for at in range(64):
         changed = bytearray(whole)
         changed[at] ^= 1 + at
         place.write_bytes(changed)
         answer = program.ask("statistics", "other", tmp_path)
         if answer[0][0] == "error":
             refused += answer[0][1] == "segment_corrupt"
-    assert refused == 128
+    assert refused == 64
 
 
 def test_tables_of_more_bytes_than_can_be_counted(
@@ -147,12 +111,12 @@ def test_a_segment_that_ends_too_early(
     whole = Path(one.shm_dir, f"shmmap.{one.instance}.statistics").read_bytes()
     place = tmp_path / "shmmap.other.statistics"
     refused = []
-    for size in (0, 1, 127, 128, 4096, 16384, *range(20_000, len(whole), 4001)):
+    for size in (0, 1, 63, 64, 4096, 16384, *range(20_000, len(whole), 4001)):
         place.write_bytes(whole[:size])
         answer = program.ask("statistics", "other", tmp_path)
         if answer[0][0] == "error":
             assert answer[0][1] == "segment_corrupt"
             refused.append(size)
-    assert refused[:6] == [0, 1, 127, 128, 4096, 16384]
+    assert refused[:6] == [0, 1, 63, 64, 4096, 16384]
     os.unlink(place)
     assert program.ask("statistics", "other", tmp_path) == [["state", "absent"]]

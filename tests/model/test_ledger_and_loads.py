@@ -87,7 +87,6 @@ class Machine(RuleBasedStateMachine):
             self.reclaimer.closer.small_bytes = 0
         self.evictor = Evictor(self.reclaimer)
         self.names_retired: list[str] = []
-        self.names_freed: list[str] = []
         self.now_s = 100.0
         self.versions = dict.fromkeys(KEYS, 1)
         self.segments: dict[str, Segment] = {}
@@ -101,9 +100,6 @@ class Machine(RuleBasedStateMachine):
     def segment_retired(self, resident: Resident, _why: str) -> None:
         self.names_retired.append(resident.name)
 
-    def segment_gone(self, name: str) -> None:
-        self.names_freed.append(name)
-
     # --- what the model derives ---------------------------------------------------------------------
 
     def of_state(self, state: str) -> list[Segment]:
@@ -115,16 +111,15 @@ class Machine(RuleBasedStateMachine):
         return found[0] if found else None
 
     def follow(self) -> None:
-        """Take over what the reclaimer said it retired and freed; nothing mapped may be among the freed."""
+        """Take over what the reclaimer retired and freed; nothing mapped may be among the freed."""
         for name in self.names_retired:
             assert self.segments[name].state == "resident"
             self.segments[name].state = "zombie"
-        for name in self.names_freed:
-            assert self.segments[name].state == "zombie"
-            assert not self.segments[name].maps, "a mapped segment was freed"
-            del self.segments[name]
         self.names_retired.clear()
-        self.names_freed.clear()
+        for segment in self.of_state("zombie"):
+            if segment.name not in self.ledger.retired:
+                assert not segment.maps, "a mapped segment was freed"
+                del self.segments[segment.name]
 
     # --- loads --------------------------------------------------------------------------------------
 
@@ -326,10 +321,10 @@ class Machine(RuleBasedStateMachine):
     @rule(draw=st.integers(0, 100), go_back=st.booleans())
     def revive(self, draw: int, go_back: bool) -> None:
         """Only a segment of exactly this version comes back, with its bytes and its name."""
-        zombie = self.any_segment(draw, "zombie")
-        key = zombie.key if zombie is not None else KEYS[draw % len(KEYS)]
-        if zombie is not None and go_back:
-            self.versions[key] = zombie.version
+        retired = self.any_segment(draw, "zombie")
+        key = retired.key if retired is not None else KEYS[draw % len(KEYS)]
+        if retired is not None and go_back:
+            self.versions[key] = retired.version
         before = self.resident_of(key)
         found = self.reclaimer.revive(key, self.versions[key], self.now_s)
         if found is not None:
@@ -403,8 +398,8 @@ class Machine(RuleBasedStateMachine):
     def bytes_are_in_one_place(self) -> None:
         ledger = self.ledger
         assert ledger.resident_bytes == sum(s.pages for s in self.of_state("resident")) * PAGE
-        zombie_bytes = ledger.retired_bytes - ledger.freeing_bytes
-        assert zombie_bytes == sum(s.pages for s in self.of_state("zombie")) * PAGE
+        mapped_bytes = ledger.retired_bytes - ledger.freeing_bytes
+        assert mapped_bytes == sum(s.pages for s in self.of_state("zombie")) * PAGE
         assert ledger.unopened_bytes == sum(
             retired.resident.nbytes for retired in ledger.retired.values() if retired.unopened
         )

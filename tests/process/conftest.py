@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import pytest
 
@@ -25,6 +25,7 @@ RESOLUTION = 0.2  # that of ``live_drive``, which compiles kernels: before pytes
 
 if TYPE_CHECKING:
     from tests.support.bridge_process import BridgeProcess
+    from tests.support.ros.processes import RosDomain
     from tests.support.ros_peer import RosPeer
 
 DaemonFactory = Callable[..., DaemonProcess]
@@ -172,6 +173,19 @@ def dds() -> Iterator[int]:
 
 
 @pytest.fixture
+def domain(daemon: DaemonFactory, tmp_path: Path) -> Iterator[RosDomain]:
+    """A domain of ROS 2 of its own; it ends before the daemons are judged."""
+    from tests.support.ros.environment import ros_python
+    from tests.support.ros.processes import ros_domain
+
+    python = ros_python()
+    if python is None:
+        pytest.skip("there is no ROS 2: python -m tests.support.ros makes it, or says why not (280 MB)")
+    with ros_domain(python, tmp_path) as one:
+        yield one
+
+
+@pytest.fixture
 def served(daemon: DaemonFactory, divided_map: DividedMap) -> DaemonProcess:
     """A daemon that serves the divided map."""
     one: DaemonProcess = daemon(divided_map.root)
@@ -201,3 +215,18 @@ def peer(dds: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[RosPeer]:
     monkeypatch.delenv("CYCLONEDDS_URI", raising=False)
     with ros_peer(dds) as one:
         yield one
+
+
+# --- requests that are under way together -------------------------------------------------------------
+
+COLD: Final = (50.0, 50.0, 5.0)
+"""Where nothing is loaded before the loaders of `one` stand still."""
+
+
+@pytest.fixture
+def one(daemon: DaemonFactory, divided_map: DividedMap) -> DaemonProcess:
+    """Return a daemon with one loader, and the cells about the origin in memory."""
+    one = daemon(divided_map.root, "--workers", "1")
+    with RawClient(one.endpoint) as client:
+        client.area(["circle", 0.0, 0.0, 20.0])
+    return one

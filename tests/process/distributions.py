@@ -7,7 +7,9 @@ what belongs there is what git would commit, as it stands on disk.  Exit code 0 
 
 from __future__ import annotations
 
+import email.message
 import email.parser
+import re
 import subprocess
 import sys
 import tarfile
@@ -58,6 +60,8 @@ PROGRAMS = {
     "shmmap-rolling",
 }
 
+LINK = re.compile(r"\]\(([^)\s]+)\)")
+
 
 def tree() -> set[str]:
     """Return the files that git would commit, relative to the repository."""
@@ -76,6 +80,19 @@ def compared(what: str, found: set[str], wanted: set[str]) -> list[str]:
     return [f"{what}: {name} does not belong there" for name in sorted(found - wanted)] + [
         f"{what}: {name} is missing" for name in sorted(wanted - found)
     ]
+
+
+def description_faults(about: email.message.Message) -> list[str]:
+    """Return what is wrong with the description: the README, with whole links if the repository has one."""
+    text, readme = str(about.get_payload()), (ROOT / "README.md").read_text(encoding="utf-8")
+    faults = [] if LINK.sub("", text).strip() == LINK.sub("", readme).strip() else ["it is not the README"]
+    url = (about["Project-URL"] or "").removeprefix("Repository, ")
+    for link, original in zip(LINK.findall(text), LINK.findall(readme), strict=False):
+        if link != original and not (url and link.startswith(url) and link.endswith(f"/HEAD/{original}")):
+            faults.append(f"the link {original} became {link}")
+        elif url and "://" not in link:
+            faults.append(f"the link {link} leads nowhere")
+    return faults
 
 
 def wheel_faults(wheel: Path, files: set[str]) -> list[str]:
@@ -98,8 +115,7 @@ def wheel_faults(wheel: Path, files: set[str]) -> list[str]:
         "Apache-2.0",
     ):
         faults.append(f"{wheel.name}: another name, version or licence in its METADATA")
-    if str(about.get_payload()).strip() != (ROOT / "README.md").read_text(encoding="utf-8").strip():
-        faults.append(f"{wheel.name}: its description is not the README")
+    faults += [f"{wheel.name}: {fault}" for fault in description_faults(about)]
     return faults + compared(f"{wheel.name}, programs", programs & PROGRAMS, PROGRAMS)
 
 

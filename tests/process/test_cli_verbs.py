@@ -11,7 +11,6 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -129,9 +128,12 @@ def test_verbs_that_look_while_the_daemon_is_stopped(shmmap: Shmmap, divided_map
         assert status["endpoint"] == shmmap.daemon.endpoint
         assert status["counters"]["map_cells"] == 36
         assert shmmap.json("health", code=1)["state"] == "stopped"
-        assert shmmap.json("ls")["state"] == "stopped"
         assert "PAUSED" in shmmap("top")
-        assert "the daemon is paused: cells on disk are not shown" in shmmap("map")
+        for verb in ("ls", "map"):
+            done = shmmap.run(verb)
+            assert (done.returncode, done.stdout) == (69, "")
+            assert "the daemon does not answer. PAUSED" in done.stderr
+            assert f"kill -CONT {pid}" in done.stderr
         assert f'shmmap_up{{daemon="{shmmap.daemon.instance}"}} 0' in shmmap("metrics")
         done = shmmap.run("clients")
         assert done.returncode == 69
@@ -148,15 +150,13 @@ def test_verbs_of_a_dead_daemon(shmmap: Shmmap) -> None:
     shmmap.daemon.kill()
     assert shmmap.json("health", code=69)["state"] == "dead"
     assert shmmap.json("status", code=69)["state"] == "dead"
-    for words in (["top"], ["map"], ["metrics"], ["tail"], ["query", "--circle", "0,0,5"]):
+    for words in (["top"], ["ls"], ["map"], ["metrics"], ["tail"], ["query", "--circle", "0,0,5"]):
         shmmap(*words, code=69)
 
 
 def test_ls_lists_what_is_resident(shmmap: Shmmap, divided_map: DividedMap) -> None:
     handles = {cell["id"]: cell for cell in shmmap.json("query", "--circle", "0,0,25")["cells"]}
-    listed: dict[str, Any] = {}
-    while len(listed) < len(handles):  # the daemon writes its table a few times a second
-        listed = {cell["id"]: cell for cell in shmmap.json("ls")["cells"]}
+    listed = {cell["id"]: cell for cell in shmmap.json("ls")["cells"]}
     assert set(listed) == set(handles)
     for cell_id, row in listed.items():
         for name in ("version", "layer", "segment", "points", "box"):
@@ -241,6 +241,35 @@ def test_export_npz_and_single_cells(reading: Shmmap, standing_map: DividedMap) 
     assert all(copy[name].tobytes() == original[name].tobytes() for name in original)
 
 
+def test_export_a_layer_and_ply(reading: Shmmap, standing_map: DividedMap) -> None:
+    source = standing_map.points("0_0.pcd")
+    low = source["z"] <= 4.0
+    reading("export", "--id", "0_0.pcd", "--layer", "crop(z_max=4.0)", "-o", "low.ply")
+    described = reading.json("inspect", "low.ply")
+    assert (described["points"], described["dropped"]) == (np.count_nonzero(low), 0)
+    head, _, body = (reading.cwd / "low.ply").read_bytes().partition(b"end_header\n")
+    assert b"property float intensity\n" in head
+    rows = np.frombuffer(body, "<f4").reshape(-1, 4)
+    assert np.array_equal(rows, np.column_stack([source[name][low] for name in ("x", "y", "z", "intensity")]))
+    (file,) = reading.json("export", "--id", "0_0.pcd", "--layer", "voxel(leaf=2.0)", "-o", "leaf.npz")[
+        "files"
+    ]
+    with np.load(reading.cwd / "leaf.npz") as archive:
+        assert sorted(archive.files) == ["count", "intensity", "xyz"]
+        assert (len(archive["count"]), archive["count"].sum()) == (file["points"], 500)
+
+
+def test_a_layer_without_points_goes_into_one_npz_per_cell(reading: Shmmap) -> None:
+    ndt = ("--id", "0_0.pcd", "--layer", "ndt(leaf=4.0)")
+    done = reading.run("export", *ndt, "-o", "ndt.pcd")
+    assert done.returncode == 2
+    assert "ndt(leaf=4.0) is no table of points" in done.stderr
+    assert "--output-dir DIR --format npz" in done.stderr
+    reading("export", *ndt, "--output-dir", "ndt", "--format", "npz")
+    with np.load(reading.cwd / "ndt" / "0_0.npz") as archive:
+        assert {"mean", "inverse_covariance"} <= set(archive.files)
+
+
 @pytest.mark.slow
 def test_export_never_overwrites_unasked_and_writes_all_or_nothing(
     shmmap: Shmmap, divided_map: DividedMap
@@ -320,21 +349,17 @@ def test_exit_codes_without_a_daemon(words: list[str], code: int, tmp_path: Path
 
 
 def test_help_status_and_errors_need_only_the_standard_library(reading: Shmmap) -> None:
-    """A client-only install has no rich, yaml or Open3D, and a broken one perhaps not even numpy.
-
-    Rows of cells need msgspec.
-    """
+    """A client-only install has no rich, yaml or Open3D, and a broken one perhaps not even numpy."""
     program = (
         "import sys\n"
         "names = ['numpy', 'zmq', 'posix_ipc', 'rich', 'yaml', 'xxhash', 'lzf', 'open3d']\n"
-        "for name in names + ['msgspec'] * ('ls' not in sys.argv):\n"
+        "for name in [*names, 'msgspec']:\n"
         "    sys.modules[name] = None\n"
         "from shmmap.cli import main\n"
         "sys.exit(main(sys.argv[1:]))"
     )
     for words, code in (
         (["status"], 0),
-        (["ls"], 0),
         (["health"], 0),
         (["health", "--instance", "other"], 69),
     ):

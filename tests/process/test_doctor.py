@@ -59,6 +59,7 @@ def test_cells_that_cannot_be_loaded_are_named(daemon: DaemonFactory, divided_ma
     assert doctor(one)[1]["cells"]["fact"] == "no load has failed"
     assert health(one)[0] == 0
     with shmmap.connect(one.endpoint, shm_dir=one.shm_dir) as client:
+        assert client.selected([str(path)], wait=20.0).failed, "the first to fail is the one that is named"
         assert client.selected([str(path), str(other)], layers=["points", "ground"], wait=20.0).failed
         assert _until(one, "cells", "fail")["advice"].startswith(f"`shmmap inspect {path}` reads")
         code, found = doctor(one)

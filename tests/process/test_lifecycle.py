@@ -11,12 +11,16 @@ import socket
 import stat
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
 import shmmap
-from shmmap.protocol.rows import CellRow
+from shmmap.client.map_listing import list_segments
+from shmmap.errors import ProtocolMismatch
 from shmmap.statistics.reader import read_statistics
 from shmmap.version import build_version
 from tests.process.conftest import DaemonFactory
@@ -156,19 +160,12 @@ def test_what_the_statistics_have(served: DaemonProcess, connect: Connect, divid
     os.waitid(os.P_PID, served.pid, os.WSTOPPED | os.WNOWAIT)
     assert read_statistics(served.instance, served.shm_dir).state == "stopped"
     served.send(signal.SIGCONT)
-    # their rows follow when clients have been answered
     seen = first_answer(
-        lambda: read_statistics(served.instance, served.shm_dir), lambda found: len(found.cells) >= 12
+        lambda: read_statistics(served.instance, served.shm_dir),
+        lambda found: found.counters["cells_resident"] >= 12,
     )
-    assert [cell.id for cell in seen.cells] == sorted(divided_map.in_circle(0, 0, 25))
-    assert {cell.state for cell in seen.cells} == {"resident"}
-    assert sum(cell.bytes for cell in seen.cells) == seen.counters["bytes_resident"] == served.segment_bytes()
-    before = {cell.id: cell for cell in seen.cells}
-    for _ in range(3):
-        client.selected(["0_0.pcd"])
-    until(lambda: read_statistics(served.instance, served.shm_dir).counters["handles_sent"] >= 15)
-    until(lambda: _row(served, "0_0.pcd").hits >= before["0_0.pcd"].hits + 3)
-    assert _row(served, "0_0.pcd").last_use_monotonic_ns > before["0_0.pcd"].last_use_monotonic_ns
+    assert seen.counters["bytes_resident"] == served.segment_bytes()
+    until(lambda: read_statistics(served.instance, served.shm_dir).counters["handles_sent"] >= 12)
     served.kill()
     assert read_statistics(served.instance, served.shm_dir).state == "dead"
     served.start()
@@ -181,9 +178,22 @@ def test_what_the_statistics_have(served: DaemonProcess, connect: Connect, divid
     assert read_statistics(served.instance, served.shm_dir).state == "absent"
 
 
-def _row(one: DaemonProcess, name: str) -> CellRow:
-    """The row of a cell."""
-    return next(c for c in read_statistics(one.instance, one.shm_dir).cells if c.id == name)
+def test_what_is_in_memory_is_listed(served: DaemonProcess, divided_map: DividedMap) -> None:
+    with shmmap.connect(served.endpoint) as client:
+        client.around(0, 0, 25, wait=60.0)
+        before = {row.id: row for row in client.list_cells()}
+        assert list(before) == sorted(divided_map.in_circle(0, 0, 25))
+        assert {row.state for row in before.values()} == {"resident"}
+        assert sum(row.bytes for row in before.values()) == served.segment_bytes()
+        for _ in range(3):
+            client.selected(["0_0.pcd"])
+        after = {row.id: row for row in client.list_cells()}
+        assert after["0_0.pcd"].hits == before["0_0.pcd"].hits + 3
+        assert after["0_0.pcd"].last_use_monotonic_ns > before["0_0.pcd"].last_use_monotonic_ns
+        assert {**after, "0_0.pcd": before["0_0.pcd"]} == before
+        older: Any = SimpleNamespace(welcome=msgspec.structs.replace(client.welcome, minor=1))
+    with pytest.raises(ProtocolMismatch, match=r"2\.1: it cannot list"):
+        list_segments(older)
 
 
 def test_nothing_is_open_to_others_without_a_group(served: DaemonProcess, connect: Connect) -> None:

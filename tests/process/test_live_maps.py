@@ -22,6 +22,7 @@ from shmmap.failpoints import LIVE_STEPS
 from shmmap.protocol import live as messages
 from shmmap.statistics.reader import StatisticsReader
 from tests.process.conftest import DaemonFactory
+from tests.support.command_line import Shmmap
 from tests.support.daemon_process import Deadline
 from tests.support.forked_programs import run_verb
 from tests.support.live_drive import FILTER, RESOLUTION, drive, marked, walk
@@ -129,7 +130,7 @@ def test_voxels_of_an_area_and_since_a_change(live_daemon: LiveDaemon) -> None:
         assert not names  # each was opened
 
 
-TIMES = {"live.map": 3, "live.synced": 1, "live.flushed": 1}
+TIMES = {"live.map": 3, "live.renamed": 1, "live.flushed": 1}
 """How often a step is taken until the worker is killed in it; the others often."""
 
 
@@ -331,6 +332,20 @@ def test_an_operator_looks_and_saves(live_daemon: LiveDaemon) -> None:
     assert "there is no live map 'radar'" in refused.stderr
 
 
+def test_files_are_found_by_the_name_that_a_daemon_has_for_the_map(
+    live_daemon: LiveDaemon, tmp_path: Path
+) -> None:
+    """Wherever they are: here a settings file that is not the installed one says where."""
+    one = live_daemon()
+    by_name = Shmmap(one, tmp_path / "elsewhere")
+    by_name.cwd.mkdir()
+    found = by_name.json("live", "fsck", "--read-only", "lidar")
+    assert found["path"] == str(tmp_path / "lidar")
+    done = by_name.run("live", "export", "lidar", "-o", "wall.ply")
+    assert (done.returncode, f"is saved in {tmp_path / 'lidar'}" in done.stderr) == (1, True)
+    assert by_name.run("live", "export", "radar", "-o", "wall.ply").returncode == 66
+
+
 def shmmap_command(*words: str) -> str:
     """What a command prints, which is to succeed."""
     done = run_verb(words)
@@ -348,7 +363,7 @@ def test_a_daemon_whose_kernels_are_compiled_is_starting(live_daemon: LiveDaemon
     waiting = Deadline()
     while waiting(len(beats) < 3):
         with StatisticsReader(one.instance, one.shm_dir) as statistics:
-            seen = statistics.snapshot(tables=False)
+            seen = statistics.snapshot()
         assert seen.state in ("absent", "starting")
         beats |= {seen.beat_monotonic_ns} - {0}
     health = run_verb(["health", "--instance", one.instance, "--shm-dir", one.shm_dir])

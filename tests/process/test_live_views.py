@@ -16,17 +16,16 @@ from typing import Any
 import pytest
 
 import shmmap as client_library
-from shmmap.chunks.voxels import ChunkKey
 from shmmap.client.event_stream import EventStream
 from shmmap.protocol import events as e
 from shmmap.protocol.rows import LiveMapRow
-from shmmap.statistics.reader import StatisticsReader
 from tests.process.conftest import DaemonFactory
 from tests.support.command_line import Shmmap
 from tests.support.daemon_process import DaemonProcess, Deadline
 from tests.support.divided_map import DividedMap
 from tests.support.live_drive import FILTER, drive
 from tests.support.live_reference import LiveDaemon, worker_of
+from tests.support.stored_chunks import change_chunk, largest
 
 
 @pytest.fixture
@@ -53,10 +52,10 @@ def until(stream: EventStream, wanted: Callable[[Any], bool]) -> Any:
 
 
 def after(one: DaemonProcess, wanted: Callable[[LiveMapRow], bool]) -> LiveMapRow:
-    """Wait until the live map's row in the statistics is as wanted."""
+    """Wait until the live map's row is as wanted."""
     waiting = Deadline()
-    with StatisticsReader(one.instance, one.shm_dir) as reader:
-        while waiting(not (rows := reader.snapshot(cells=False).live) or not wanted(rows[0])):
+    with client_library.connect(one.endpoint) as client:
+        while waiting(not wanted((rows := client.live_maps())[0])):
             pass
     return rows[0]
 
@@ -87,7 +86,7 @@ def test_what_operators_see(live_daemon: LiveDaemon, tmp_path: Path) -> None:
         assert {name: found[name] for name in ("name", "scans", "problem")} == {
             "name": "lidar", "scans": 3, "problem": "",
         }  # fmt: skip
-        said = r"^live lidar +[\d,]+ chunks, .* of 16\.0 MiB, [\d,]+ known voxels, all saved$"
+        said = r"^live lidar +[\d,]+ chunks, .* of 16\.0 MiB, [\d,]+ voxels known, all saved$"
         assert re.search(said, shmmap("status"), re.MULTILINE)
         assert re.search(r"^live +lidar: [\d,]+ chunks   [\d,]+ clean ", shmmap("top"), re.MULTILINE)
         metrics = shmmap("metrics")
@@ -108,8 +107,14 @@ def test_what_operators_see(live_daemon: LiveDaemon, tmp_path: Path) -> None:
 
         one.send(signal.SIGSTOP)
         os.waitid(os.P_PID, one.pid, os.WSTOPPED | os.WNOWAIT)
-        (stopped,) = shmmap.json("status")["live"]
-        assert (stopped["scans"], stopped["durable"]) == (3, 3)
+        assert shmmap.json("status")["live"] == []
+        assert re.search(r"^live +lidar: the daemon does not answer$", shmmap("status"), re.MULTILINE)
+        (silent,) = (one for one in shmmap.json("doctor", code=1)["findings"] if one["name"] == "live maps")
+        assert (silent["skipped"], silent["fact"]) == (True, "lidar: the daemon does not answer")
+        metrics = shmmap("metrics")
+        assert f'shmmap_up{{daemon="{one.instance}"}} 0\n' in metrics
+        assert "shmmap_live_restarts_total" in metrics
+        assert "shmmap_live_chunks" not in metrics
         one.send(signal.SIGCONT)
 
 
@@ -149,28 +154,28 @@ def test_events_report_changes_and_the_worker_s_end(
     assert re.search(r"  live      the live worker ended \(1 time by now\)", tail)
 
 
-def test_a_damaged_file_is_reported_and_named(
+def test_a_damaged_chunk_is_reported_and_named(
     live_daemon: LiveDaemon, listen: Callable[[DaemonProcess], EventStream], tmp_path: Path
 ) -> None:
     one = live_daemon()
     with mapped(one, 1):
         pass
     one.stop()
-    victim = max((tmp_path / "lidar").rglob("*.chunk"))
-    victim.write_bytes(victim.read_bytes()[:-1])
+    victim = largest(tmp_path / "lidar")
+    change_chunk(tmp_path / "lidar", victim, lambda data: data[:-1])
     one.start()
     stream = listen(one)
     shmmap = Shmmap(one, tmp_path)
     with client_library.connect(one.endpoint) as client:
         live = client.live("lidar")
-        x, y, z, *_ = ChunkKey.from_text(victim.stem).box(live.resolution)
+        x, y, z, *_ = victim.box(live.resolution)
         live.move_to(x + 1.0, y + 1.0, z + 1.0)
         damaged = until(stream, lambda h: isinstance(h, e.LiveDamaged))
         assert damaged.map == "lidar"
-        assert victim.stem in damaged.what
+        assert victim.text in damaged.what
         found = {row["name"]: row for row in json.loads(shmmap.run("doctor", "--json").stdout)["findings"]}
         assert found["live maps"]["state"] == "warn"
-        assert victim.stem in found["live maps"]["fact"]
+        assert victim.text in found["live maps"]["fact"]
         assert found["live disk"]["state"] in ("ok", "warn")
         assert str(tmp_path / "lidar") in found["live disk"]["fact"]
         assert found["live memory"]["state"] == "ok"

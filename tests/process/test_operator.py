@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import json
 import os
 import pty
 import re
 import select
 import signal
+import struct
 import subprocess
 import sys
 import termios
@@ -37,17 +40,9 @@ def after(shmmap: Shmmap, wanted: Callable[[dict[str, int]], bool]) -> dict[str,
     """Wait until the counters are as wanted; returns them."""
     waiting = Deadline()
     with StatisticsReader(shmmap.daemon.instance, shmmap.daemon.shm_dir) as reader:
-        while waiting(not wanted(reader.snapshot(tables=False).counters)):
+        while waiting(not wanted(reader.snapshot().counters)):
             pass
-        return reader.snapshot(tables=False).counters
-
-
-def until_shown(shmmap: Shmmap, count: int) -> None:
-    """Wait until the table of resident cells has ``count`` rows: it lags a little behind."""
-    waiting = Deadline()
-    with StatisticsReader(shmmap.daemon.instance, shmmap.daemon.shm_dir) as reader:
-        while waiting(len(reader.snapshot().cells) < count):
-            pass
+        return reader.snapshot().counters
 
 
 @pytest.fixture
@@ -182,7 +177,6 @@ def test_a_client_cannot_write_to_an_operator_s_terminal(shmmap: Shmmap, divided
 
 def test_metrics_and_files(shmmap: Shmmap, divided_map: DividedMap, tmp_path: Path) -> None:
     shmmap("query", "--circle", "0,0,25")
-    until_shown(shmmap, len(divided_map.in_circle(0, 0, 25)))
     metrics = shmmap("metrics")
     assert f'shmmap_up{{daemon="{shmmap.daemon.instance}"}} 1' in metrics
     picture, page = tmp_path / "map.svg", tmp_path / "map.html"
@@ -202,7 +196,6 @@ def test_a_picture_of_too_many_cells(
 ) -> None:
     """Those on disk are left out, and not even asked for; the map's extent and those in memory are there."""
     shmmap("query", "--circle", "0,0,5")
-    until_shown(shmmap, 4)
     for name, value in shmmap.environment.items():
         if name.startswith("SHMMAP_"):
             monkeypatch.setenv(name, value)
@@ -246,6 +239,140 @@ def read_until(fd: int, wanted: bytes, seen: bytes = b"") -> bytes:
     return seen
 
 
+class TopScreen:
+    """``shmmap top`` on a terminal of its own, as an operator sees it and types at it."""
+
+    def __init__(self, shmmap: Shmmap, columns: int, lines: int, **variables: str) -> None:
+        self._ours, self._theirs = pty.openpty()
+        fcntl.ioctl(self._theirs, termios.TIOCSWINSZ, struct.pack("4H", lines, columns, 0, 0))
+        self._before = termios.tcgetattr(self._theirs)
+        environment = shmmap.environment | {"TERM": "xterm-256color"} | variables
+        for name in {"NO_COLOR", "COLUMNS", "LINES"} - variables.keys():
+            environment.pop(name, None)
+        self.program = subprocess.Popen(
+            [sys.executable, "-m", "shmmap.cli", "top", "--interval", "0.05"],
+            env=environment, stdin=self._theirs, stdout=self._theirs, stderr=self._theirs,
+            start_new_session=True,
+        )  # fmt: skip
+        self.raw = b""
+
+    def __enter__(self) -> TopScreen:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.program.kill()
+        self.program.wait(DEADLINE_S)
+        os.close(self._ours)
+        os.close(self._theirs)
+
+    def until(self, shown: Callable[[list[str]], bool]) -> list[str]:
+        """Wait until a whole screen is as wanted; return its lines without colours."""
+        end_s = time.monotonic() + DEADLINE_S
+        lines: list[str] = []
+        while not lines or not shown(lines):
+            left_s = max(0.0, end_s - time.monotonic())
+            assert select.select([self._ours], [], [], left_s)[0], "\n".join(lines)
+            self.raw = (self.raw + os.read(self._ours, 65536))[-200_000:]
+            whole = self.raw.decode("utf-8", "replace").rpartition("\x1b[J")[0].rpartition("\x1b[H")[2]
+            lines = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", whole).split("\r\n")
+        return lines
+
+    def press(self, keys: str) -> None:
+        os.write(self._ours, keys.encode())
+
+    def ended(self) -> int:
+        """Wait for the end; the terminal is as it was."""
+        self.raw = read_until(self._ours, b"\x1b[?1049l", self.raw)
+        code = self.program.wait(DEADLINE_S)
+        assert termios.tcgetattr(self._theirs) == self._before
+        return code
+
+
+def names_shown(lines: list[str]) -> list[str]:
+    """Return the names in the table of clients."""
+    at = next((at for at, line in enumerate(lines) if line.startswith("CLIENT")), len(lines))
+    names = []
+    for line in lines[at + 1 :]:
+        if not line:
+            break
+        names.append(line.split()[0])
+    return names
+
+
+LONG = "perception_of_the_front_left_camera_and_the_lidar_behind_it_no_1"
+
+
+def test_top_on_a_small_terminal(shmmap: Shmmap) -> None:
+    """Twelve clients on 80x24: memory, the verdict, who holds most, how many more, and keys."""
+    with contextlib.ExitStack() as stack:
+        held = []
+        for number in range(12):
+            name = LONG if number == 1 else f"node_{number}"
+            client = stack.enter_context(client_library.connect(shmmap.daemon.endpoint, name=name))
+            held.append(client.around(0.0, 0.0, radius=60.0 - 5 * number, wait=20.0))
+        with TopScreen(shmmap, 80, 24) as top:
+            lines = top.until(lambda lines: " more  " in lines[-1] and "seen for" in lines[-1])
+            assert len(lines) == 24
+            assert max(map(len, lines)) <= 80
+            assert "\x1b[1;32mhealthy" in top.raw.decode("utf-8", "replace")
+            starts = [line.split("  ")[0].strip() for line in lines]
+            for label in ("map", "verdict", "memory", "hits", "waits", "CLIENT"):
+                assert label in starts, lines
+            shown = names_shown(lines)
+            assert shown[0] == "node_0"
+            assert LONG[:12] in shown[1]
+            assert 3 <= len(shown) < 12
+            assert lines[-1].startswith(f"{12 - len(shown)} more  ")
+            top.press("jj")
+            assert names_shown(top.until(lambda lines: names_shown(lines)[:1] == ["node_2"]))
+            top.press("\x1b[A")
+            top.until(lambda lines: LONG[:12] in names_shown(lines)[0])
+            top.press("sss")
+            lines = top.until(lambda lines: "by name" in lines[-1])
+            assert names_shown(lines)[:3] == ["node_0", "node_10", "node_11"]
+            top.press("q")
+            assert top.ended() == 0
+        del held
+
+
+def test_top_without_colours_and_on_a_tiny_terminal(shmmap: Shmmap) -> None:
+    with TopScreen(shmmap, 30, 7, NO_COLOR="1") as top:
+        lines = top.until(lambda lines: any(line.startswith("verdict") for line in lines))
+        assert len(lines) == 7
+        assert not re.search(rb"\x1b\[[0-9;]*m", top.raw)
+        top.press("\x04")
+        assert top.ended() == 0
+
+
+def test_top_stops_and_goes_on(shmmap: Shmmap) -> None:
+    """Ctrl-Z leaves the terminal as it was; when continued, it is taken again."""
+    with TopScreen(shmmap, 80, 24) as top:
+        top.until(lambda lines: "q quit" in lines[-1])
+        top.program.send_signal(signal.SIGTSTP)
+        os.waitid(os.P_PID, top.program.pid, os.WSTOPPED | os.WNOWAIT)
+        top.raw = read_until(top._ours, b"\x1b[?1049l", top.raw)
+        assert termios.tcgetattr(top._theirs) == top._before
+        top.program.send_signal(signal.SIGCONT)
+        top.raw = b""
+        top.until(lambda lines: "q quit" in lines[-1])
+        top.press("q")
+        assert top.ended() == 0
+
+
+def test_a_dumb_terminal_gets_it_once(shmmap: Shmmap) -> None:
+    ours, theirs = pty.openpty()
+    try:
+        done = subprocess.run(
+            [sys.executable, "-m", "shmmap.cli", "top"], env=shmmap.environment | {"TERM": "dumb"},
+            stdin=theirs, stdout=theirs, timeout=DEADLINE_S, check=True,
+        )  # fmt: skip
+        assert done.returncode == 0
+        assert b"\x1b" not in read_until(ours, b"no client is connected")
+    finally:
+        os.close(ours)
+        os.close(theirs)
+
+
 @pytest.mark.parametrize(
     ("number", "code"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129), (signal.SIGINT, 0)]
 )
@@ -271,13 +398,22 @@ def test_top_leaves_the_terminal_as_it_was(shmmap: Shmmap, number: signal.Signal
         os.close(theirs)
 
 
-@pytest.mark.parametrize(("verb", "shown"), [("top", b"no client is connected"), ("tail", b"the daemon is")])
-def test_a_terminal_that_is_gone_ends_what_shows_without_end(shmmap: Shmmap, verb: str, shown: bytes) -> None:
+@pytest.mark.parametrize(
+    ("verb", "keys", "shown"),
+    [
+        ("top", False, b"no client is connected"),
+        ("top", True, b"q quit"),
+        ("tail", False, b"the daemon is"),
+    ],
+)
+def test_a_terminal_that_is_gone_ends_what_shows_without_end(
+    shmmap: Shmmap, verb: str, *, keys: bool, shown: bytes
+) -> None:
     ours, theirs = pty.openpty()
     environment = shmmap.environment | {"TERM": "xterm-256color", "COLUMNS": "100", "LINES": "40"}
     with subprocess.Popen(
         [sys.executable, "-m", "shmmap.cli", verb],
-        env=environment, stdin=subprocess.DEVNULL, stdout=theirs, stderr=subprocess.PIPE,
+        env=environment, stdin=theirs if keys else subprocess.DEVNULL, stdout=theirs, stderr=subprocess.PIPE,
         start_new_session=True,  # which has no terminal of its own: no SIGHUP comes
     ) as program:  # fmt: skip
         os.close(theirs)

@@ -14,12 +14,14 @@ import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
 import shmmap
 from shmmap.daemon.config import load_config
 from tests.process.conftest import DaemonFactory
+from tests.support.cloud_bytes import write_las
 from tests.support.command_line import Shmmap, publish
 from tests.support.daemon_process import ROOT, Deadline
 from tests.support.divided_map import DividedMap, make_map
@@ -28,6 +30,7 @@ from tests.support.pages import Terminal, read_page, reader_with_programs
 from tests.support.web_servers import faulty_web, free_port
 
 README = read_page("README.md")
+START = read_page(".github/site/START.md")
 CLIENTS = read_page("clients/README.md")
 LIVE_MAPS = read_page("shmmap/client/live/LIVE_MAPS.md")
 PUBLISHING = read_page("shmmap/publishing/PUBLISHING.md")
@@ -35,15 +38,16 @@ SERVING = read_page("shmmap/publishing/SERVING_FROM_A_BUCKET.md")
 SLICES = read_page("shmmap/publishing/SLICES.md")
 
 TESTED = {  # the named blocks of a page, and how many more blocks of commands or programs it has
-    "README.md": ("clone server points window cpp cpp-run", 2),  # the lines that make an environment
+    "README.md": ("clone server points cpp cpp-run ros", 2),  # the lines that make an environment
+    ".github/site/START.md": ("picture serve look window", 0),
     "clients/README.md": (
         "first-scan-map first-scan ndt pose-init compare elevation elevation-whole",
-        5,  # of commands
+        6,  # of commands
     ),
     "shmmap/client/live/LIVE_MAPS.md": ("serve map read", 0),
-    "shmmap/dividing/OWN_CLOUD.md": ("install serve query", 0),
+    "shmmap/dividing/OWN_CLOUD.md": ("install serve query view browser", 0),
     "shmmap/origin/AUTOWARE_MAP.md": ("serve query python", 0),
-    "shmmap/publishing/GATEWAY.md": ("nginx start serve", -1),  # one is a configuration
+    "shmmap/publishing/GATEWAY.md": ("start serve", 0),
     "shmmap/publishing/PUBLISHING.md": (
         "install credentials publish directory fetch install-sign sign rotate versions",
         0,
@@ -53,8 +57,8 @@ TESTED = {  # the named blocks of a page, and how many more blocks of commands o
         -5,  # settings, output
     ),
     "shmmap/publishing/SLICES.md": (
-        "install credentials by-hand parallel slurm kubernetes dask",
-        -2,  # a script and a manifest
+        "install credentials by-hand parallel slurm dask",
+        -1,  # a script
     ),
 }
 
@@ -107,12 +111,11 @@ def publisher(tmp_path: Path, buckets: BucketServer) -> Iterator[Terminal]:
         yield reader.terminal(ROOT)
 
 
-# --- README.md, LAYERS.md -----------------------------------------------------------------------------
+# --- README.md -----------------------------------------------------------------------------------------
 
 
 def test_the_readme_is_short() -> None:
     assert len(README.text.encode()) < 6000
-    assert re.findall(r"^(\d+)\. ", README.text, re.MULTILINE) == [str(n) for n in range(1, 11)]
     assert len([line for line in README.blocks["points"] if line]) == 3
 
 
@@ -121,6 +124,16 @@ def test_two_lines_do_everything() -> None:
     assert tests.endswith(" && pytest -q")
     (everything,) = read_page("shmmap/INSTALL.md").commands("everything")
     assert demo == f"{everything} && shmmap demo"
+
+
+def test_three_lines_for_ros() -> None:
+    """ROS has numpy; the others are those of the client-only install."""
+    _, install, node = README.commands("ros")
+    packages, ours = re.findall(r"pip install -q ([^&]+)", install)
+    (client_only,) = read_page("shmmap/INSTALL.md").commands("client-only")
+    assert f" numpy {packages.strip()} " in client_only
+    assert ours == "--no-deps ."
+    assert f'\n{node} = "' in (ROOT / "pyproject.toml").read_text(encoding="utf-8")
 
 
 def test_measured_rows_name_their_benchmarks() -> None:
@@ -153,10 +166,44 @@ def test_programs_of_the_readme(newcomer: Terminal) -> None:
     number = re.fullmatch(r"(\d+) points\n", newcomer.python(README.blocks["points"]))
     assert number is not None
     assert int(number[1]) > 10_000
-    numbers = re.fullmatch(r"(\d+) cells, (\d+) points near\n", newcomer.python(README.blocks["window"]))
+
+
+# --- START.md -----------------------------------------------------------------------------------------
+
+
+def test_a_cloud_is_drawn(tmp_path: Path) -> None:
+    pytest.importorskip("laspy", reason="laspy is not installed")
+    install, view = START.commands("picture")
+    assert [install] == read_page("shmmap/dividing/OWN_CLOUD.md").commands("install")
+    x, y = np.random.default_rng(0).uniform(0.0, 60.0, (2, 3000))
+    write_las(tmp_path / "city.las", {"x": x, "y": y, "z": x / 30.0, "intensity": y})
+    with reader_with_programs(tmp_path) as reader:
+        assert "wrote city.png: 3,000 points of 1 file" in reader.terminal().run(view)
+    assert (tmp_path / "city.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_map_is_served_looked_at_and_followed(newcomer: Terminal) -> None:
+    """The daemon is that of the README's lines; there the terminal is at home, too."""
+    assert START.commands("serve") == [line.replace(" town", " ~/town") for line in README.commands("server")]
+    status, query, view = map(newcomer.run, START.commands("look"))
+    assert "healthy" in status
+    assert "town_160_160.pcd" in query
+    assert "wrote place.png: " in view
+    numbers = re.fullmatch(r"(\d+) cells, (\d+) points near\n", newcomer.python(START.blocks["window"]))
     assert numbers is not None
-    assert int(numbers[1]) > 50
+    assert int(numbers[1]) > 30
     assert int(numbers[2]) > 10_000
+
+
+def test_the_same_program_follows_a_vehicle_on_another_map(
+    daemon: DaemonFactory, divided_map: DividedMap, user: Terminal
+) -> None:
+    one = daemon(divided_map.root)
+    user.run(f"export SHMMAP_ENDPOINT='{one.endpoint}' SHMMAP_SHM_DIR='{one.shm_dir}'")
+    assert re.fullmatch(r"[1-9]\d* cells, [1-9]\d* points near\n", user.python(START.blocks["window"]))
+
+
+# --- C++, LAYERS.md ------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -426,7 +473,7 @@ def test_the_script_for_slurm_and_the_manifest_for_kubernetes_make_their_slices(
     assert "--array=1-64 " in script
     made = slices(f"export SLURM_ARRAY_TASK_ID=17\n{script}")
     assert "17 of 64, 1 cell\n" in made
-    job = yaml.safe_load("\n".join(SLICES.blocks["kubernetes"]))
+    job = yaml.safe_load(SLICES.path.with_name("slices.kubernetes.yaml").read_text(encoding="utf-8"))
     assert (job["kind"], job["spec"]["completions"], job["spec"]["completionMode"]) == ("Job", 64, "Indexed")
     (container,) = job["spec"]["template"]["spec"]["containers"]
     assert container["command"] == ["sh", "-c"]

@@ -33,9 +33,10 @@ MAY_BE_REFUSED = {
     "client": {
         *(_FILES | _LAYERS),
         *(f"shmmap.{name}" for name in _WINDOWS),
-        *("client.live#0", "client.live#1", "events", "live", "shmmap.events", "shmmap.live"),
+        *("client.futures", "client.live#0", "client.live#1"),
+        *("events", "live", "shmmap.events", "shmmap.live"),
     },
-    "all": {*(_FILES | _LAYERS), "live", "shmmap.live"},
+    "all": {*(_FILES | _LAYERS), "client.futures", "live", "shmmap.live"},
 }
 """Uses of what a program had not loaded before."""
 
@@ -120,6 +121,8 @@ def walked(
 
 def reached(ended: str) -> str:
     """Return an outcome in which a daemon that just died or came is out of reach, however it was noticed."""
+    if ended in SILENT:  # a property's value
+        return "DaemonUnreachable"
     return re.sub(rf"shmmap\.errors\.({'|'.join(SILENT)})\b", "shmmap.errors.DaemonUnreachable", ended)
 
 

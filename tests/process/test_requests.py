@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -133,6 +136,32 @@ def test_requests_in_flight_are_distinguished(
         reply = client.receive()
         x = asked.pop(reply[1])
         assert names(client.cells_reply(reply).cells) == standing_map.in_circle(x, 0, 1)
+
+
+def test_a_cancelled_wait_leaves_its_place(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    one = daemon(divided_map.root, "--workers", "1")
+    client = connect(one)
+    assert client.minor >= 1
+    client.selected(["-60_-60.pcd"])  # starts the loader
+    stopped = one.stop_loaders()
+    ask = partial(client.send, "area", circle(0, 0, 5), ["points"], 60.0)
+    waiting = [ask() for _ in range(64)]
+    assert client.cells_reply(client.wait_for(ask())).pending, "the 65th does not wait"
+    client.send_bytes(pack(["cancel", waiting.pop(7)]))
+    client.send_bytes(pack(["cancel", 2**64 - 1]))
+    waiting.append(ask())
+    client.ask("stats")
+    assert not client.readable()
+    for pid in stopped:
+        os.kill(pid, signal.SIGCONT)
+    for _ in range(64):
+        reply = client.receive()
+        waiting.remove(reply[1])
+        assert names(client.cells_reply(reply).cells) == divided_map.in_circle(0, 0, 5)
+    client.ask("stats")
+    assert not client.readable()
 
 
 def test_a_warm_handle_costs_under_200_bytes(standing: DaemonProcess, connect: Connect) -> None:

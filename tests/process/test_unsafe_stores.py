@@ -15,6 +15,7 @@ from tests.support.command_line import Verbs
 from tests.support.divided_map import DividedMap, make_map
 from tests.support.map_stores import BucketServer
 from tests.support.store_proxy import (
+    IGNORING,
     Answer,
     Asked,
     Forward,
@@ -24,16 +25,9 @@ from tests.support.store_proxy import (
     honest,
     page,
     with_tags,
-    without_headers,
 )
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
-
-IGNORING = {
-    "If-None-Match": without_headers("if-none-match"),
-    "If-Match": without_headers("if-match"),
-    "If-Match and If-None-Match": without_headers("if-match", "if-none-match"),
-}
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from tests.support.daemon_process import ROOT, until
 from tests.support.divided_map import make_map
 from tests.support.forked_programs import run_verb
 from tests.support.map_stores import KEYS
-from tests.support.web_servers import FaultyWeb, faulty_web
+from tests.support.web_servers import WRONG_ANSWERS, FaultyWeb, endless_error, faulty_web
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 pytest.importorskip("obstore", reason="obstore is not installed")
@@ -105,6 +105,47 @@ def test_signals_end_what_waits_for_a_store(
         said, _ = process.communicate(timeout=20.0)
     assert process.returncode == code, said
     assert "Traceback" not in said
+
+
+@pytest.mark.slow
+def test_an_error_without_end_takes_no_memory(
+    web: FaultyWeb, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A verb that kept what comes until its limit, 62 s, would need ten times what this one is allowed."""
+    environment = {**ENVIRONMENT, "XDG_STATE_HOME": str(tmp_path / "state"), "AWS_ENDPOINT_URL": web.url}
+    monkeypatch.setitem(WRONG_ANSWERS, "endless error", endless_error)
+    web.fault = lambda _path: "endless error"
+    for verb, code in (("versions", 75), ("fetch", 75), ("serve", 71), ("publish", 75)):
+        command = [sys.executable, "-m", "shmmap.cli", *words_of(verb, web, tmp_path, "s3")]
+        done = subprocess.run(
+            ["bash", "-c", f'ulimit -d {2 << 20}; exec "$@"', "bash", *command],
+            env=environment, capture_output=True, text=True,
+        )  # fmt: skip
+        said = [line for line in done.stderr.splitlines() if line.startswith("shmmap: ")]
+        assert said, (verb, done)
+        assert "its answer, which is no object, has more than 64 MiB" in said[0], (verb, done.stderr)
+        assert done.returncode == code, (verb, done.stderr)
+
+
+@pytest.mark.slow
+@pytest.mark.minutes
+def test_verbs_wait_as_long_as_the_page_says(web: FaultyWeb, tmp_path: Path) -> None:
+    """A whole answer has 31 s; one of a bucket that is an error 62 s."""
+    environment = {**ENVIRONMENT, "XDG_STATE_HOME": str(tmp_path / "state"), "AWS_ENDPOINT_URL": web.url}
+    web.fault = lambda path: "drip error" if path.startswith("maps/bad") else "drip body"
+    asked = {f"{web.url}/{TOWN}": 31, "s3://maps/town": 31, "s3://maps/bad": 62}
+    started = {
+        url: subprocess.Popen(
+            [sys.executable, "-m", "shmmap.cli", "versions", url],
+            env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        )
+        for url in asked
+    }  # fmt: skip
+    for url, process in started.items():
+        with process:
+            said, _ = process.communicate(timeout=120.0)
+        assert f"the answer was not complete within {asked[url]} s" in said.splitlines()[0]
+        assert process.returncode == 75
 
 
 def test_a_spoilt_token_is_an_error_with_a_name(web: FaultyWeb, tmp_path: Path) -> None:

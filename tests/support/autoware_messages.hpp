@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Autoware's `GetDifferentialPointCloudMap`, with members named as ROS 2's generator names them, without ROS.
+// Autoware's services for cells of the map, with members named as ROS 2's generator names them, without ROS.
 
 #ifndef TESTS_SUPPORT_AUTOWARE_MESSAGES_HPP
 #define TESTS_SUPPORT_AUTOWARE_MESSAGES_HPP
@@ -53,6 +53,25 @@ struct Response {
 struct Service {
   using Request = plain::Request;
   using Response = plain::Response;
+};
+
+/// Its `GetPartialPointCloudMap`.
+struct Partial {
+  struct Request {
+    decltype(plain::Request::area) area;
+  };
+  struct Response {
+    Header header;
+    std::vector<Cell> new_pointcloud_with_ids;
+  };
+};
+
+/// Its `GetSelectedPointCloudMap`.
+struct Selected {
+  struct Request {
+    std::vector<std::string> cell_ids;
+  };
+  using Response = Partial::Response;
 };
 
 }  // namespace plain

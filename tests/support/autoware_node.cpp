@@ -2,9 +2,14 @@
 // What Autoware's scan matcher does with its `PcdLoaderFunction`, a line at a time; words are separated by
 // tabs.
 //
-//   loader ENDPOINT WAIT TIMEOUT     a new PcdLoader, a new NdtLeaves, and a node that holds nothing
+//   loader ENDPOINT WAIT TIMEOUT [MAX_BYTES [plain]]
+//                                     a new PcdLoader, a new NdtLeaves; the node holds what it held
 //   update X Y RADIUS                 as the node's `update_ndt`: ids held, then add, then remove
+//   held                              ids and checksums of points that the node holds: of cells that came under
+//                                     one id the first, as in Autoware's compare filter
 //   ask X Y RADIUS IDS                with these ids, separated by ";"; what comes is not taken over
+//   service X Y RADIUS IDS            the same as a service asks
+//   name ID VERSION, split NAME       names of cells, and what they stand for
 //   const X Y RADIUS                  as `update`, by a function that returns a pointer to const
 //   grids X Y RADIUS                  as `update`, with voxels; `leaves` prints what is held
 //   forget                            the node begins again, as on a rebuild
@@ -57,7 +62,8 @@ struct Leaf {
 std::function<std::shared_ptr<Response>(const std::shared_ptr<Request>&)> loader;
 std::function<std::shared_ptr<const Response>(const std::shared_ptr<Request>&)> loader_of_const;
 std::unique_ptr<shmmap::NdtLeaves<Leaf>> leaves;
-std::set<std::string> ids;
+std::function<std::shared_ptr<Response>(const std::shared_ptr<Request>&)> service;
+std::map<std::string, std::uint32_t> clouds;  // checksums by id
 std::map<std::string, std::vector<Leaf>> grids;
 
 void make(const std::vector<std::string>& words) {
@@ -70,12 +76,18 @@ void make(const std::vector<std::string>& words) {
     std::cout << "log\t" << message << "\n";
     throw std::runtime_error("logging may fail");
   };
+  if (words.size() > 4) options.max_bytes = std::stoull(words[4]);
+  options.plain_ids = words.size() > 5 && words[5] == "plain";
   const shmmap::PcdLoader<Service> made(options);
   loader = made;
   loader_of_const = made;
+  service = [services = shmmap::MapServices(options)](const std::shared_ptr<Request>& request) {
+    shmmap::Shortfall lacks;
+    auto response = services.answer<Service>(*request, lacks);
+    if (!lacks.why.empty()) std::cout << "log\t" << lacks.why << "\n";
+    return response;
+  };
   leaves = std::make_unique<shmmap::NdtLeaves<Leaf>>(2.0, options);
-  ids.clear();
-  grids.clear();
 }
 
 std::shared_ptr<Request> request_for(const std::vector<std::string>& words,
@@ -86,6 +98,11 @@ std::shared_ptr<Request> request_for(const std::vector<std::string>& words,
   request->area.radius = std::stof(words.at(3));
   request->cached_ids = held;
   return request;
+}
+
+template <typename Cloud>
+std::uint32_t checksum(const Cloud& cloud) {
+  return shmmap::detail::crc32(cloud.data.data(), cloud.data.size());
 }
 
 void print(const Response& response) {
@@ -102,7 +119,7 @@ void print(const Response& response) {
     for (const auto& field : cloud.fields)
       std::cout << field.name << ":" << field.offset << ":" << unsigned{field.datatype} << ":" << field.count
                 << " ";
-    std::cout << "\t" << shmmap::detail::crc32(cloud.data.data(), cloud.data.size()) << "\n";
+    std::cout << "\t" << checksum(cloud) << "\n";
   }
   for (const auto& id : response.ids_to_remove) std::cout << "remove\t" << id << "\n";
 }
@@ -115,8 +132,9 @@ void take(const Pointer& response) {
     return;
   }
   print(*response);
-  for (const auto& cell : response->new_pointcloud_with_ids) ids.insert(cell.cell_id);
-  for (const auto& id : response->ids_to_remove) ids.erase(id);
+  for (const auto& cell : response->new_pointcloud_with_ids)
+    clouds.insert({cell.cell_id, checksum(cell.pointcloud)});
+  for (const auto& id : response->ids_to_remove) clouds.erase(id);
 }
 
 void take_grids(const std::shared_ptr<Request>& request) {
@@ -190,15 +208,10 @@ std::vector<std::string> split(const std::string& text, char at) {
   return parts;
 }
 
-template <typename Keys>
-std::vector<std::string> keys(const Keys& from) {
+template <typename Value>
+std::vector<std::string> keys(const std::map<std::string, Value>& from) {
   std::vector<std::string> found;
-  for (const auto& one : from) {
-    if constexpr (std::is_same_v<Keys, std::set<std::string>>)
-      found.push_back(one);
-    else
-      found.push_back(one.first);
-  }
+  for (const auto& [key, value] : from) found.push_back(key);
   return found;
 }
 
@@ -207,11 +220,19 @@ void obey(const std::vector<std::string>& words) {
   if (what == "loader") {
     make(words);
   } else if (what == "update") {
-    take(loader(request_for(words, keys(ids))));
+    take(loader(request_for(words, keys(clouds))));
   } else if (what == "const") {
-    take(loader_of_const(request_for(words, keys(ids))));
-  } else if (what == "ask") {
-    const auto response = loader(request_for(words, split(words.at(4), ';')));
+    take(loader_of_const(request_for(words, keys(clouds))));
+  } else if (what == "held") {
+    for (const auto& [id, crc] : clouds) std::cout << id << "\t" << crc << "\n";
+  } else if (what == "name") {
+    std::cout << shmmap::versioned_id(words.at(1), std::stoull(words.at(2))) << "\n";
+  } else if (what == "split") {
+    const auto [id, version] = shmmap::split_id(words.at(1));
+    std::cout << id << "\t" << (version ? std::to_string(*version) : "none") << "\n";
+  } else if (what == "ask" || what == "service") {
+    const auto request = request_for(words, words.size() > 4 ? split(words[4], ';') : std::vector<std::string>());
+    const auto response = what == "ask" ? loader(request) : service(request);
     if (response)
       print(*response);
     else
@@ -223,7 +244,7 @@ void obey(const std::vector<std::string>& words) {
   } else if (what == "refused" || what == "crooked") {
     print_made(what == "crooked");
   } else if (what == "forget") {
-    ids.clear();
+    clouds.clear();
     grids.clear();
   } else {
     std::cout << "unknown\t" << what << "\n";

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node of ``tests/support/autoware_node.cpp``, compiled with its own message types or with ROS 2's."""
+"""Programs in C++ with messages of ROS 2: with types of their own, or with those of its generator."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ from typing import Final
 
 from tests.support.cpp_client import FLAGS
 from tests.support.daemon_process import ROOT
+from tests.support.ros.definitions import DEFINITIONS
 
 NODE: Final = ROOT / "tests" / "support" / "autoware_node.cpp"
+SERVICES: Final = ROOT / "tests" / "support" / "map_services.cpp"
 
 
 def compiled_with(types: str, source: Path, folder: Path) -> Path | None:
@@ -29,14 +31,16 @@ def compiled_with(types: str, source: Path, folder: Path) -> Path | None:
         options = ["-DSHMMAP_GENERATED", *found]
     program = folder / source.stem
     checks = ["-std=c++17", "-O0", "-g1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", *FLAGS]
+    options.append(f"-I{ROOT / 'clients' / 'ros' / 'include'}")
     subprocess.run(["g++", *checks, *options, str(source), "-o", str(program), "-pthread"], check=True)
     return program
 
 
 class AutowareNode:
-    """One such process."""
+    """A process of `NODE`, or of another program that is asked in lines of words."""
 
-    def __init__(self, program: Path) -> None:
+    def __init__(self, program: Path, end: str = "end") -> None:
+        self._end = f"{end}\n"
         self._process = subprocess.Popen(
             [program],
             stdin=subprocess.PIPE,
@@ -52,7 +56,7 @@ class AutowareNode:
         print(*words, sep="\t", file=self._process.stdin, flush=True)
         found: list[list[str]] = []
         for line in self._process.stdout:
-            if line == "end\n":
+            if line == self._end:
                 return found
             found.append(line.removesuffix("\n").split("\t"))
         raise AssertionError(f"it ended with {self._process.wait()}")
@@ -70,30 +74,6 @@ GENERATORS: Final = Path("/usr/share/rosidl_generator_cpp/resource")
 TYPES: Final = ("generated",) if GENERATORS.is_dir() else ("plain",)
 """The program's own types where ROS 2's generator is missing."""
 _RUNTIMES: Final = ("rosidl_runtime_cpp", "rosidl_runtime_c", "rosidl_typesupport_interface")
-
-_DEFINITIONS: Final = {
-    "builtin_interfaces/msg/Time.msg": "int32 sec\nuint32 nanosec\n",
-    "std_msgs/msg/Header.msg": "builtin_interfaces/Time stamp\nstring frame_id\n",
-    "sensor_msgs/msg/PointField.msg": (
-        "uint8 INT8=1\nuint8 UINT8=2\nuint8 INT16=3\nuint8 UINT16=4\nuint8 INT32=5\nuint8 UINT32=6\n"
-        "uint8 FLOAT32=7\nuint8 FLOAT64=8\nstring name\nuint32 offset\nuint8 datatype\nuint32 count\n"
-    ),
-    "sensor_msgs/msg/PointCloud2.msg": (
-        "std_msgs/Header header\nuint32 height\nuint32 width\nPointField[] fields\nbool is_bigendian\n"
-        "uint32 point_step\nuint32 row_step\nuint8[] data\nbool is_dense\n"
-    ),
-    "autoware_map_msgs/msg/AreaInfo.msg": "float32 center_x\nfloat32 center_y\nfloat32 radius\n",
-    "autoware_map_msgs/msg/PointCloudMapCellMetaData.msg": (
-        "float32 min_x\nfloat32 min_y\nfloat32 max_x\nfloat32 max_y\n"
-    ),
-    "autoware_map_msgs/msg/PointCloudMapCellWithID.msg": (
-        "string cell_id\nsensor_msgs/PointCloud2 pointcloud\nPointCloudMapCellMetaData metadata\n"
-    ),
-    "autoware_map_msgs/srv/GetDifferentialPointCloudMap.srv": (
-        "AreaInfo area\nstring[] cached_ids\n---\nstd_msgs/Header header\n"
-        "PointCloudMapCellWithID[] new_pointcloud_with_ids\nstring[] ids_to_remove\n"
-    ),
-}
 
 # run by the system's Python, for which Debian installs rosidl
 _GENERATE: Final = """
@@ -122,11 +102,12 @@ def generated_messages(folder: Path) -> list[str] | None:
     """Generate the types into a directory; returns the compiler's options for them, None without rosidl."""
     if not GENERATORS.is_dir() or shutil.which("/usr/bin/python3") is None:
         return None
-    for name, text in _DEFINITIONS.items():
+    packages = ["autoware_map_msgs", "builtin_interfaces", "sensor_msgs", "std_msgs"]
+    for name, text in DEFINITIONS.items():
         path = folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
-    packages = sorted({name.split("/", 1)[0] for name in _DEFINITIONS})
+        if path.parts[len(folder.parts)] in packages:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text)
     (folder / "packages.json").write_text(json.dumps(packages))
     done = subprocess.run(
         ["/usr/bin/python3", "-c", _GENERATE, str(folder), str(GENERATORS)],

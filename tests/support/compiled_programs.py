@@ -182,7 +182,7 @@ class PclNdt:
         return answer
 
 
-# Programs that take long to compile are compiled once for all of pytest's processes
+# What takes long to compile, or to make, is made once for all of pytest's processes
 
 
 def built_once(
@@ -201,6 +201,21 @@ def built_once(
             done.write_text(str(build(folder) or ""))
         found = done.read_text()
     return Path(found) if found else None
+
+
+def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
+    """Return a directory, only for reading, that ``make`` has filled in the process that came first."""
+
+    def build(folder: Path) -> Path:
+        made = folder / "made"
+        shutil.rmtree(made, ignore_errors=True)  # another process has failed
+        made.mkdir()
+        make(made)
+        return made
+
+    found = built_once(factory, name, build)
+    assert found is not None
+    return found
 
 
 # Libraries in C that tests load into a program before all others (LD_PRELOAD)

@@ -153,18 +153,6 @@ void print_statistics(const std::string& instance, const std::string& shm_dir) {
     for (const auto count : one.counts) std::cout << count << " ";
     std::cout << "\n";
   }
-  for (const auto& one : found.cells)
-    std::cout << "cell\t" << one.id << "\t" << one.layer << "\t" << one.segment << "\t" << one.version << "\t"
-              << one.bytes << "\t" << one.points << "\t" << static_cast<int>(one.state) << "\t" << one.hits << "\t"
-              << one.min_x << " " << one.min_y << " " << one.max_x << " " << one.max_y << "\t" << one.ahead
-              << "\n";
-  for (const auto& one : found.clients)
-    std::cout << "client\t" << one.session << "\t" << one.pid << "\t" << one.uid << "\t" << one.cells << "\t"
-              << one.bytes << "\t" << one.client << "\t" << one.command << "\t"
-              << (one.pose ? (*one.pose)[0] : -1.0) << "\n";
-  for (const auto& one : found.live_maps)
-    std::cout << "live\t" << one.name << "\t" << one.chunks << "\t" << one.files << "\t" << one.scans << "\t"
-              << one.budget_bytes << "\n";
 }
 
 void print(const shmmap::Happening& happening) {

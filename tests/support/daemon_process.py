@@ -7,7 +7,8 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, TypeVar
 
@@ -38,6 +39,7 @@ __all__ = [
     "next_reload",
     "open_files",
     "processes_marked",
+    "standing_still",
     "stop",
     "until",
     "wait_ended",
@@ -219,6 +221,17 @@ def first_answer(
     while waiting(not fits(answer := ask()), why):
         pass
     return answer
+
+
+@contextmanager
+def standing_still(one: DaemonProcess) -> Iterator[None]:
+    """The loaders stand still meanwhile."""
+    stopped = one.stop_loaders()
+    try:
+        yield
+    finally:
+        for pid in stopped:
+            os.kill(pid, signal.SIGCONT)
 
 
 def counters(one: DaemonProcess) -> dict[str, int]:

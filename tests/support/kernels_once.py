@@ -19,8 +19,6 @@ from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from typing import Any, Final
 
-__all__ = ["watch"]
-
 LATE: Final = frozenset(
     {
         "shmmap.chunks.applying_kernels",

@@ -3,20 +3,23 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable
+from contextlib import closing
 from pathlib import Path
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 import shmmap
-from shmmap.chunks.chunk_file import encode_chunk
+from shmmap.chunks.chunk_file import encode_chunk, read_file_header
 from shmmap.chunks.marking import Marker
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.client.live.live_map import ChunkInfo, LiveMap
 from shmmap.daemon.live.disk.folder import Folder
 from shmmap.daemon.live.disk.map_files import MapFiles
-from shmmap.daemon.live.disk.map_record import MapSettings
+from shmmap.daemon.live.disk.map_record import MapSettings, Row
 from tests.support.chunk_memory import ChunkMemory
 from tests.support.daemon_process import DaemonProcess
 from tests.support.live_drive import FILTER, RESOLUTION, SETTINGS, SlowOccupancy, Voxel, drive
@@ -74,17 +77,41 @@ def stored_drive(
     codec: str = "zlib",
 ) -> dict[Voxel, int]:
     """Map a drive, moved by metres, and save it; returns all voxels known."""
-    folder = Folder(directory)
-    files = MapFiles(folder, settings)
-    memory = ChunkMemory(RESOLUTION, settings.occupancy, files.map_id)
+    with closing(Folder(directory)) as folder, closing(MapFiles(folder, settings)) as files:
+        memory = _driven(scans, shift, settings, files.map_id)
+        for key, view in memory.chunks.items():
+            files.save(key, encode_chunk(view, codec))
+        files.write_record()
+    return memory.voxels()
+
+
+def _driven(
+    scans: int, shift: tuple[float, float, float], settings: MapSettings, map_id: bytes
+) -> ChunkMemory:
+    memory = ChunkMemory(RESOLUTION, settings.occupancy, map_id)
     marker = Marker(RESOLUTION, FILTER)
     for number, (points, pose) in enumerate(drive(scans), 1):
         pose[:3, 3] += shift
         memory.apply(marker.mark(points, pose)[0], scan=number)
+    return memory
+
+
+def old_directory(directory: Path, scans: int = 6) -> dict[Voxel, int]:
+    """Save a drive as versions before 0.4 did, with a file for each chunk; returns all voxels known."""
+    directory.mkdir(mode=0o700)
+    map_id = bytes(range(16))
+    memory = _driven(scans, (0.0, 0.0, 0.0), SETTINGS, map_id)
+    rows = {}
     for key, view in memory.chunks.items():
-        files.save(key, encode_chunk(view, codec))
-    files.write_manifest()
-    folder.close()
+        data = encode_chunk(view)
+        (directory / f"{key.text}.chunk").write_bytes(data)
+        rows[key.text] = msgspec.to_builtins(Row.of(read_file_header(data)))
+    settings = msgspec.to_builtins(SETTINGS)
+    mappers = [{"number": 1, "uid": 1000, "name": "front", "scans": 1 << 20}]
+    record = {"format": 1, "map_id": map_id.hex(), "settings": settings, "mappers": mappers, "lives": 3}
+    (directory / "map.json").write_text(json.dumps({**record, "next_mapper": 2}))
+    manifest = {"format": 1, "chunks": rows, "applied": {"1": scans}, "missing": {}}
+    (directory / "manifest.json").write_text(json.dumps(manifest))
     return memory.voxels()
 
 

@@ -32,6 +32,7 @@ import pytest
 
 from shmmap.errors import Offline
 from tests.support.command_line import Verbs
+from tests.support.compiled_programs import made_once
 from tests.support.daemon_process import Deadline, LineProcess, until
 from tests.support.divided_map import make_map
 
@@ -403,9 +404,12 @@ def signed_maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     Directories ``one``, ``two``, ``equal``, ``other``; their ``keys`` and ``others``; ``town`` has the files.
     """
+    return made_once(tmp_path_factory, "signed", _make_signed_maps)
+
+
+def _make_signed_maps(folder: Path) -> None:
     from tests.support.published_maps import Signed
 
-    folder = tmp_path_factory.mktemp("signed")
     made = make_map(folder / "town", columns=2, rows=1, points=100)
     run = Verbs(folder)
     run("publish", made.root, folder / "one", "--sign", folder / "keys", "--id-prefix", "/town/")
@@ -417,7 +421,6 @@ def signed_maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made.change("0_0.pcd", seed=2)
     run("publish", made.root, folder / "equal", "--sign", folder / "keys")
     Signed(folder / "equal", folder / "keys").write_all(3)  # newer than the other version 2
-    return folder
 
 
 class MemoryStore:

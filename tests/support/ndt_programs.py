@@ -19,6 +19,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
@@ -36,6 +37,9 @@ from shmmap_clients.scans.trajectory import read_trajectory, tum_line
 from shmmap.demo.program import process_memory
 from shmmap.simulation.lidar import Lidar
 from shmmap.simulation.town import Town
+
+if TYPE_CHECKING:
+    import pytest
 
 
 def not_shared(voxel_map: VoxelMap) -> list[str]:
@@ -67,7 +71,7 @@ def localize(endpoint: str, scan_file: str, words: str, radius: str) -> None:
         before = process_memory(os.getpid()).private_bytes
         rules = MapRules(map_radius=float(radius), lidar_radius=50.0)
         with MapUpdater(endpoint, rules, prepare=matcher.prepare) as maps:
-            voxel_map, _ = maps.map_at(float(guess[0]), float(guess[1]))
+            voxel_map = maps.map_at(float(guess[0]), float(guess[1]))
             matcher.set_map(voxel_map)
             result = matcher.align(scan, matrix_from_pose(guess))
             found = {
@@ -190,6 +194,23 @@ def make_town_drive(
         lines.append(tum_line(0.1 * number, T))
     (folder / "truth.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
     return TownDrive(folder / "map", scans, folder / "truth.txt", cloud, poses)
+
+
+def town_drive_once(
+    factory: pytest.TempPathFactory, *, blocks: tuple[int, int], density: float, frames: int, step: float
+) -> TownDrive:
+    """Return such a drive, made once for all of pytest's processes."""
+    from tests.support.compiled_programs import made_once  # not for the programs
+
+    def make(folder: Path) -> None:
+        drive = make_town_drive(folder, blocks=blocks, density=density, frames=frames, step=step)
+        np.savez(folder / "drive.npz", points=drive.points, poses=drive.poses)
+
+    folder = made_once(factory, f"drive-{blocks}-{density}-{frames}-{step}".replace(" ", ""), make)
+    with np.load(folder / "drive.npz") as arrays:
+        return TownDrive(
+            folder / "map", folder / "scans", folder / "truth.txt", arrays["points"], arrays["poses"]
+        )
 
 
 if __name__ == "__main__":

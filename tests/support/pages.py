@@ -157,7 +157,7 @@ class Terminal:
                 daemon = subprocess.Popen(
                     ["bash", "-c", script],
                     cwd=self._cwd,
-                    env=self._environment | {"NOTIFY_SOCKET": "@" + address[1:]},
+                    env=self._environment | {"NOTIFY_SOCKET": "@" + address[1:], "PYTHONFAULTHANDLER": "1"},
                     stdin=subprocess.DEVNULL,
                     stdout=output,
                     stderr=output,
@@ -171,10 +171,12 @@ class Terminal:
             finally:
                 daemon.send_signal(signal.SIGINT)
                 ended = wait_ended(daemon.pid)
+                state = "" if ended else Path(f"/proc/{daemon.pid}/status").read_text(encoding="utf-8")
                 if not ended:
-                    daemon.kill()
+                    daemon.send_signal(signal.SIGABRT)  # its log then has each thread's stack
+                    daemon.send_signal(signal.SIGCONT)
                 code = daemon.wait()
-            assert ended, f"{command}: Ctrl-C did not end it"
+            assert ended, f"{command}: Ctrl-C did not end it\n{state}\n{log.read_text()}"
             assert code == 0, f"{command}: {code}\n{log.read_text()}"
 
 

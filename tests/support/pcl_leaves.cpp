@@ -98,7 +98,8 @@ void compare(const shmmap::Cell& points, const shmmap::Cell& ndt, float leaf) {
 void compare(const plain::Cell& cell) {
   const auto& ours = cell.pointcloud;
   pcl::PCLPointCloud2 theirs;
-  if (pcl::io::loadPCDFile(cell.cell_id, theirs) != 0) throw std::runtime_error(cell.cell_id);
+  const std::string id = shmmap::split_id(cell.cell_id).first;
+  if (pcl::io::loadPCDFile(id, theirs) != 0) throw std::runtime_error(id);
   bool fields = ours.fields.size() == theirs.fields.size();
   for (std::size_t at = 0; fields && at < ours.fields.size(); ++at) {
     const auto& one = ours.fields[at];
@@ -111,7 +112,7 @@ void compare(const plain::Cell& cell) {
                       ours.is_bigendian == (theirs.is_bigendian != 0) &&
                       ours.is_dense == (theirs.is_dense != 0);
   std::printf("{\"id\": \"%s\", \"points\": %u, \"fields\": %d, \"layout\": %d, \"data\": %d}\n",
-              cell.cell_id.c_str(), ours.width, fields, layout, ours.data == theirs.data);
+              id.c_str(), ours.width, fields, layout, ours.data == theirs.data);
 }
 
 double now(clockid_t clock) {

@@ -12,18 +12,6 @@ from tests.support.command_line import health
 from tests.support.daemon_process import ROOT, DaemonProcess, Deadline, first_answer
 from tests.support.web_servers import FaultyWeb
 
-__all__ = [
-    "ALL",
-    "all_cells",
-    "flip",
-    "until",
-    "until_asked",
-    "until_health",
-    "until_taken",
-    "versions_of",
-    "without",
-]
-
 ALL = shmmap.Box(-1e6, -1e6, 1e6, 1e6)
 
 

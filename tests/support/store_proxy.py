@@ -10,8 +10,7 @@ from __future__ import annotations
 import http.client
 import http.server
 import threading
-from collections.abc import Callable, Iterator, MutableMapping
-from contextlib import contextmanager
+from collections.abc import Callable, MutableMapping
 from dataclasses import dataclass, field
 from typing import Final
 from urllib.parse import urlsplit
@@ -65,6 +64,14 @@ def without_headers(*names: str) -> Rule:
         return forward(asked)
 
     return rule
+
+
+IGNORING: Final = {
+    "If-None-Match": without_headers("if-none-match"),
+    "If-Match": without_headers("if-match"),
+    "If-Match and If-None-Match": without_headers("if-match", "if-none-match"),
+}
+"""Stores that ignore conditions, by those that they ignore."""
 
 
 def with_tags(change: Callable[[str], str], *methods: str) -> Rule:
@@ -173,13 +180,3 @@ class StoreProxy:
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
-
-
-@contextmanager
-def store_proxy(endpoint: str) -> Iterator[StoreProxy]:
-    """Run a proxy until the end of the block."""
-    proxy = StoreProxy(endpoint)
-    try:
-        yield proxy
-    finally:
-        proxy.close()

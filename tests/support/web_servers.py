@@ -89,6 +89,11 @@ WRONG_ANSWERS: dict[str, Callable[[bytes], Iterable[bytes]]] = {
 """What is sent in place of an answer with this content; then the connection is closed."""
 
 
+def endless_error(_data: bytes) -> Iterable[bytes]:
+    """A refusal whose text does not end: another of `WRONG_ANSWERS`, which leaves no others a processor."""
+    return itertools.chain([_head("403 Forbidden")], itertools.repeat(b"x" * (1 << 16)))
+
+
 def _pause() -> Iterator[bytes]:
     time.sleep(DRIP_S)
     yield b""
@@ -131,6 +136,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         """Answer."""
         web = self.server.web
+        web.last_headers = {name.lower(): value for name, value in self.headers.items()}
         path = self.path.lstrip("/")
         self.rfile.read(int(self.headers.get("Content-Length", "0")))
         fault = web.fault(path)
@@ -213,6 +219,7 @@ class FaultyWeb:
         self.fault: Fault = _no_fault
         self.tag: Callable[[bytes], str] = _digest
         self.clock_ahead_s = 0.0
+        self.last_headers: dict[str, str] = {}
         self.connections: set[socket.socket] = set()
         self._requests: list[tuple[str, int]] = []
         self._healed = threading.Event()

@@ -210,7 +210,7 @@ def test_a_restart_keeps_the_cells_and_a_stop_does_not(fresh: BootedSystemd) -> 
 
 def test_the_first_client_starts_it(fresh: BootedSystemd) -> None:
     fresh.run("systemctl", "start", "shmmapd.socket")
-    text = shmmap(fresh, "doctor", user="alice").stdout
+    text = shmmap(fresh, "doctor", "--all", user="alice").stdout
     assert "waits for the first client" in text
     assert fresh.properties("shmmapd")["ActiveState"] == "inactive"
     made = fresh.shell("stat -c '%i %a %U:%G' /run/shmmap/default.sock")

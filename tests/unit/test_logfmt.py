@@ -92,3 +92,31 @@ def test_under_systemd(
     assert len(lines) > 7
     assert all(line.startswith("<3>") for line in lines[5:])
     assert lines[-1] == r"<3>ValueError: no\x1b[2J"
+
+
+def test_a_log_without_a_reader_holds_nothing_up(
+    root_logger: logging.Logger, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Lines are whole or left out, and their number is said."""
+    monkeypatch.setenv("JOURNAL_STREAM", "8:12345")
+    reading, writing = os.pipe()
+    with open(reading, "rb", 0) as reader, open(writing, "w", encoding="utf-8") as stderr:
+        monkeypatch.setattr("sys.stderr", stderr)
+        set_up_logging()
+        log = logging.getLogger("shmmap.z")
+        for number in range(1000):
+            log.info("line %d %s", number, "x" * 2500)
+        lines = [part for part in os.read(reading, 1 << 20).decode().split("\n") if part]
+        log.info("read again")
+        for number in range(3):
+            log.info("line %d", number)
+        stderr.close()
+        after = reader.read().decode().splitlines()
+    assert 10 < len(lines) < 100
+    for number, line in enumerate(lines[:-1]):
+        assert line == f"<6>line {number} " + "x" * 2500
+    whole = len(lines) - (len(lines[-1]) < 2500)
+    assert after[-5:] == [
+        f'<4>log lines left out: nothing read them count={1000 - whole}',
+        "<6>read again", "<6>line 0", "<6>line 1", "<6>line 2",
+    ]  # fmt: skip

@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 import re
 import shlex
+import subprocess
 import sys
 
 import pytest
@@ -115,6 +116,18 @@ def test_nothing_says_that_the_package_is_on_an_index() -> None:
         assert not re.search(r"pip3? install[^\n&|]*['\" ]shmmap(\[|['\"`\s])", text), path
 
 
+def test_every_extra_has_its_packages_and_its_weight() -> None:
+    """`python -m tests.benchmarks.extras_weight` measures it."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    rows = re.findall(
+        r"^\| `pip install (.*?)` \| (\d+) \| ", read_page("shmmap/INSTALL.md").text, re.MULTILINE
+    )
+    named = {tuple(sorted(shlex.split(packages))): int(megabytes) for packages, megabytes in rows}
+    for extra, packages in project["optional-dependencies"].items():
+        if extra not in ("test", "dev", "docs"):
+            assert named.get(tuple(sorted(packages)), 0) > 0, extra
+
+
 def test_the_small_installs_name_the_dependencies() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     needed = [re.split(r"[><=;]", one)[0] for one in project["dependencies"] if not one.startswith("open3d")]
@@ -124,3 +137,16 @@ def test_the_small_installs_name_the_dependencies() -> None:
         first, second = re.findall(r"pip install -q ([^&]+)", line)
         assert first.split() == packages, name
         assert second == "--no-deps ."
+
+
+def test_what_readme_makes_is_not_offered_to_git() -> None:
+    text = read_page("README.md").text
+    made = re.findall(r"(?:--keep-map|-o) (\S+)", text)
+    assert len(made) == 2
+    if not (ROOT / ".git").exists():
+        pytest.skip("this is no checkout")
+    paths = [f"{name}/a.pcd" if name == "town" else name for name in made]
+    done = subprocess.run(
+        ["git", "check-ignore", *paths], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.stdout.split() == paths

@@ -33,6 +33,7 @@ from shmmap_clients.shared_options import (
     add_radius_option,
     add_scan_option,
     add_scans_option,
+    bag_options_from,
     pose_from,
     reader_from,
 )
@@ -40,8 +41,6 @@ from shmmap_clients.shared_options import (
 if TYPE_CHECKING:
     from shmmap_clients.compare_map_filter.drive import DriveStatistics
     from shmmap_clients.compare_map_filter.rule import CompareRule
-
-__all__ = ["main"]
 
 _NAME: Final = "shmmap-compare"
 _FOLLOW_JSON: Final = """\
@@ -257,6 +256,7 @@ def _add_apply(subparsers: Any) -> None:
 
 def _apply(args: argparse.Namespace) -> int:
     """Filter the files, and print the results."""
+    import dataclasses
     from pathlib import Path
 
     import numpy as np
@@ -267,14 +267,12 @@ def _apply(args: argparse.Namespace) -> int:
     from shmmap_clients.compare_map_filter.output import PcdDirectory, TopView
     from shmmap_clients.compare_map_filter.rule import to_map
     from shmmap_clients.map_extent import extent_text
-    from shmmap_clients.scans.scan_names import stem
-    from shmmap_clients.scans.scan_sequence import Scan
+    from shmmap_clients.scan_drive import read_one_scan
 
     rule = _rule_from(args)
     T = pose_from(args, "--pose") if args.pose is not None else np.eye(4)
     reader = reader_from(args, _NAME)
-    columns, rows = reader.screened(reader.read(args.scan))
-    scan = Scan(stem(Path(args.scan)), 0.0, columns, T, rows=rows)
+    scan = dataclasses.replace(read_one_scan(args.scan, reader, bag_options_from(args)), T_map_sensor=T)
     table = build_layer(rule.layer, reader_from(args, _NAME, min_range=0.0).points(args.map))
     compare = CompareMapFilter(rule, backend=args.backend).use_tables([table])
     comparison = compare.apply(scan.xyz, T)

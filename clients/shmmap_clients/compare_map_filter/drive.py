@@ -14,8 +14,6 @@ from shmmap_clients.compare_map_filter.filter import CompareMapFilter, Compariso
 from shmmap_clients.scans.scan_sequence import Scan
 from shmmap_clients.spread import RunningSpread
 
-__all__ = ["ComparedScan", "DriveStatistics", "ScanComparer"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ComparedScan:

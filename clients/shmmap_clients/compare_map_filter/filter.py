@@ -16,8 +16,6 @@ from shmmap.layers import LayerTable, canonical_layer
 from shmmap_clients.compare_map_filter.rule import CompareRule, explain, to_map
 from shmmap_clients.compare_map_filter.search_table import SearchCell, SearchTable
 
-__all__ = ["CompareMapFilter", "Comparison"]
-
 BACKENDS = ("numba", "numpy")
 
 

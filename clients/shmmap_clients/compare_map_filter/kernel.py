@@ -26,8 +26,6 @@ from shmmap_clients.compare_map_filter.search_table import (
 )
 from shmmap_clients.elements_at import float32_at, float64_at, int32_at
 
-__all__ = ["explain"]
-
 
 @numba.njit(inline="always")
 def _coordinate(address: Any, double: Any, index: Any) -> Any:

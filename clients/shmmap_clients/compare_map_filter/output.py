@@ -18,8 +18,6 @@ from shmmap_clients.scans.trajectory import quaternion_of
 from shmmap_clients.spread import Decimated
 from shmmap_clients.streams import is_endpoint
 
-__all__ = ["Output", "PcdDirectory", "Stream", "TopView", "open_output"]
-
 _SIDE_PX: Final = 1200.0  # longest side of the picture
 _MARGIN: Final = 2.0  # metres
 _REMOVED: Final = (178, 186, 194, 255)

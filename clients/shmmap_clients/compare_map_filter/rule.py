@@ -29,8 +29,6 @@ from numpy.typing import NDArray
 from shmmap import BadRequest
 from shmmap_clients.compare_map_filter.search_table import TILE_COLUMNS, SearchCell, SearchTable
 
-__all__ = ["DISTANCE", "MODES", "SLACK", "VOXEL", "VOXEL_DISTANCE", "CompareRule", "explain", "to_map"]
-
 MODES: Final = ("voxel", "voxel-distance", "distance")
 VOXEL, VOXEL_DISTANCE, DISTANCE = range(3)
 SLACK: Final = 1e-6

@@ -13,20 +13,6 @@ from numpy.typing import NDArray
 from shmmap import BadRequest, Cell
 from shmmap.layers import LayerTable
 
-__all__ = [
-    "ADDRESS_START",
-    "ADDRESS_TILE",
-    "ADDRESS_XYZ",
-    "FIRST_X",
-    "FIRST_Y",
-    "IS_DOUBLE",
-    "TILES_X",
-    "TILES_Y",
-    "TILE_COLUMNS",
-    "SearchCell",
-    "SearchTable",
-]
-
 TILE_COLUMNS = 8  # as in `shmmap.layers.ground`: 8 x 8 columns in a tile
 _MAX_BINS: Final = 1 << 16
 _REACH_COLUMNS: Final = 2  # columns of neighbours within one leaf, and a margin for rounding

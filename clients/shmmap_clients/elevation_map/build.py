@@ -26,16 +26,6 @@ from shmmap_clients.elevation_map.grid import ElevationGrid
 from shmmap_clients.elevation_map.heights import ElevationRule
 from shmmap_clients.elevation_map.seams import ColumnBox, Columns, Seams, column_boxes
 
-__all__ = [
-    "BuildProgress",
-    "BuiltElevation",
-    "Checkpoint",
-    "Journal",
-    "MapChanged",
-    "build_elevation_map",
-    "far_cells",
-]
-
 _APART_M: Final = 1000.0  # cells nearer than about this distance are in one part of the map
 _SHARE: Final = 0.01  # share of the map's bytes: a larger part is not a stray point
 _FEW_BYTES: Final = 4096

@@ -38,8 +38,6 @@ if TYPE_CHECKING:
     from shmmap_clients.elevation_map.build import BuildProgress, BuiltElevation
     from shmmap_clients.elevation_map.heights import ElevationRule
 
-__all__ = ["main"]
-
 _ATTEMPTS = 3
 _EVERY_S = 0.5
 _NAMED: Final = 5  # number of omitted cells that are named

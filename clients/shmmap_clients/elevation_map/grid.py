@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from shmmap import BadRequest
 from shmmap_clients.elevation_map import holes
 
-__all__ = ["FILLED", "MEASURED", "NOTHING", "ElevationGrid"]
-
 NOTHING, MEASURED, FILLED = range(3)
 _NAN_BITS: Final = np.float32(np.nan).view(np.uint32)
 _LONGEST_SIDE: Final = 1 << 20  # columns: 100 km of 0.1 m

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from shmmap import BadRequest, MapWindow
 from shmmap.layers import canonical_layer
 
-__all__ = ["RULES", "ElevationRule", "WindowHeights"]
-
 RULES: Final = ("surface", "min", "mean", "max")
 _FARTHEST: Final = 1 << 40  # columns; beyond every layer
 

@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 from shmmap import BadRequest
 from shmmap.compiling import compiled, read_only
 
-__all__ = ["fill_holes", "fill_reach"]
-
 _FIT_MORE: Final = 2.0  # columns behind the rim of a hole, which make the heights a plane instead of a line
 _FARTHEST: Final = 100.0  # columns; time grows with the square
 _LEAST: Final = 3  # heights: fewer do not represent their surroundings

@@ -21,8 +21,6 @@ from shmmap.formats.npz_writer import npz_archive
 from shmmap.formats.png import PngWriter
 from shmmap_clients.elevation_map.grid import ElevationGrid
 
-__all__ = ["check_output", "hillshade", "write_elevation", "write_hillshade"]
-
 _GEOTIFF: Final = (".tif", ".tiff")
 _SUFFIXES: Final = (".npz", ".png", *_GEOTIFF)
 _USER_DEFINED: Final = 32767  # GeoTIFF 1.1: the highest code, a user-defined system

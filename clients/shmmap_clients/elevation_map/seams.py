@@ -10,8 +10,6 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["ColumnBox", "Columns", "Seams", "column_boxes"]
-
 # margin around a cell's box for rounded points: metres, and a relative part for float32 coordinates
 _MARGIN: Final = 1e-3
 _ROUNDING: Final = 2.0**-22

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from shmmap.compiling import compiled, inlined
 from shmmap_clients.elevation_map.heights import ElevationRule
 
-__all__ = ["surface_heights"]
-
 
 def surface_heights(
     xyz: NDArray[Any], column: NDArray[np.int64], rule: ElevationRule

@@ -25,6 +25,7 @@ from shmmap.lazy_imports import lazy_names
 if TYPE_CHECKING:
     from shmmap_clients.ndt_scan_matcher.backends.backend import Backend, DeviceError, DeviceOptions
     from shmmap_clients.ndt_scan_matcher.backends.registry import BACKENDS
+    from shmmap_clients.ndt_scan_matcher.map.map_updater import MapRules, MapUpdater
     from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelCell, VoxelMap, cell_from_layer, voxel_cell
     from shmmap_clients.ndt_scan_matcher.matching.evaluation import (
         Evaluation,
@@ -44,6 +45,8 @@ __all__ = [
     "DeviceOptions",
     "Evaluation",
     "Limits",
+    "MapRules",
+    "MapUpdater",
     "NdtMatcher",
     "Regularization",
     "Result",

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 
 from shmmap import BadRequest
 
-__all__ = ["ParzenEstimator", "RoughPose"]
-
 _UNKNOWN_YAW: Final = math.pi / math.sqrt(3.0)  # standard deviation of a uniform heading
 _DRAWS: Final = 100
 _MAX_GOOD: Final = 10

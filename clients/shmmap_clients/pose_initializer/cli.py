@@ -31,6 +31,7 @@ from shmmap_clients.shared_options import (
     add_sigma_options,
     add_thin_option,
     add_trust_options,
+    bag_options_from,
     pose_from,
     pose_text,
     reader_from,
@@ -40,8 +41,6 @@ from shmmap_clients.shared_options import (
 
 if TYPE_CHECKING:
     from shmmap_clients.pose_initializer import InitialPose
-
-__all__ = ["main"]
 
 _NAME: Final = "shmmap-pose-init"
 _JSON: Final = f"""\
@@ -109,6 +108,7 @@ def _run(args: argparse.Namespace) -> int:
     from shmmap_clients.map_extent import NoMapHere
     from shmmap_clients.ndt_scan_matcher import pose_from_matrix
     from shmmap_clients.pose_initializer import InitializerRules, PoseInitializer, RoughPose
+    from shmmap_clients.scan_drive import read_one_scan
     from shmmap_clients.scans.scan_file import thinned
 
     x, y, z, roll, pitch, yaw = pose_from_matrix(pose_from(args, "--pose")).tolist()
@@ -122,7 +122,7 @@ def _run(args: argparse.Namespace) -> int:
         seed=args.seed,
     )
     reader = reader_from(args, _NAME)
-    scan = thinned(reader.points(args.scan), args.thin or None)
+    scan = thinned(read_one_scan(args.scan, reader, bag_options_from(args)).xyz, args.thin or None)
     with (
         connect(args, _NAME) as client,
         PoseInitializer(

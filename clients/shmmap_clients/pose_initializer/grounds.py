@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 
 from shmmap_clients.ndt_scan_matcher import VoxelCell
 
-__all__ = ["STOREY_M", "Ground", "flat_pieces", "ground_at", "grounds_of", "levels_of"]
-
 STOREY_M: Final = 1.8
 """Least distance of two levels, metres: less than the headroom of any car park."""
 

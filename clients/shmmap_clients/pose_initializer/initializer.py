@@ -40,8 +40,6 @@ from shmmap_clients.pose_initializer.grounds import (
     levels_of,
 )
 
-__all__ = ["Alternative", "InitialPose", "InitializerRules", "PoseInitializer", "Relocalizer"]
-
 _APART_M: Final = 1.0
 _APART_YAW: Final = math.radians(10.0)
 _SEED_APART_M: Final = 0.5
@@ -534,9 +532,13 @@ class Relocalizer:
         self._initializer: PoseInitializer | None = None
         self._sigma_m = sigma_m
         self._sigma_yaw = sigma_yaw
-        self._knows_z = knows_z
+        self._knows_z = self._knows_first_z = knows_z
         self._failures = 0
         self.error: ShmmapError | None = None
+
+    def restart(self) -> None:
+        """Begin again, around another pose."""
+        self._failures, self._knows_z = 0, self._knows_first_z
 
     def __call__(self, points: NDArray[np.floating], T_guess: NDArray[np.float64]) -> Result | None:
         """Return a trusted result, or None.

@@ -20,6 +20,7 @@ from shmmap_clients.command_line import (
     add_verb,
     complain,
     connect,
+    counted,
     finite,
     not_negative,
     nothing_found,
@@ -35,6 +36,7 @@ from shmmap_clients.shared_options import (
     add_poses_option,
     add_quiet_option,
     add_scans_option,
+    bag_options_from,
     reader_from,
 )
 
@@ -43,8 +45,6 @@ if TYPE_CHECKING:
     from shmmap_clients.rolling_map.live_map import DriveStatistics
     from shmmap_clients.rolling_map.parameters import Parameters, Shown
     from shmmap_clients.scan_drive import ScanDrive
-
-__all__ = ["main"]
 
 _NAME: Final = "shmmap-rolling"
 _PARTS: Final = ("occupied", "free", "chunks", "usage")
@@ -92,6 +92,7 @@ def _add_run(subparsers: Any) -> None:
     )
     parser.add_argument(
         "--mapper",
+        "--name",
         default=_NAME,
         metavar="NAME",
         help=f"name under which scans are counted: each running program needs its own (default: {_NAME})",
@@ -214,19 +215,23 @@ def _run(args: argparse.Namespace) -> int:
     """Map the scans to their end."""
     from shmmap_clients.rolling_map.live_map import DriveStatistics, map_scan
     from shmmap_clients.scan_drive import ScanDrive
+    from shmmap_clients.scans.bag import is_bag
     from shmmap_clients.streams import is_endpoint
 
     parameters = _parameters_from(args)
     shown = _shown_from(args, parameters)
     scan_filter = _scan_filter_from(args, parameters)
-    if args.resume and is_endpoint(args.scans):
+    if args.resume and (is_endpoint(args.scans) or is_bag(args.scans)):
         raise BadRequest(
             "--resume is for a directory of scans",
-            hint="leave it out: a publisher's scans count as they come",
+            hint="leave it out: scans of a publisher or a bag count as they come",
         )
     with contextlib.ExitStack() as stack:
         # the map filters and counts points by its own limits
-        drive = ScanDrive(args, _NAME, args.poses, stack, reader=reader_from(args, _NAME, min_range=None))
+        # rays begin at the scanner, whose frame the limits are in
+        bag = bag_options_from(args, map_frame=_frame(args, parameters) or "map", frame="sensor")
+        reader = reader_from(args, _NAME, min_range=None)
+        drive = ScanDrive(args, _NAME, args.poses, stack, reader=reader, bag=bag)
         client = stack.enter_context(connect(args, _NAME))
         live = client.live(args.live, frame_id=_frame(args, parameters))
         if parameters is not None:
@@ -332,9 +337,8 @@ def _report(args: argparse.Namespace, live: LiveMap, mapper: LiveMapper, statist
     times = summary["add_ms"]
     spent = f"; {times['p50']:.1f} ms each (p99 {times['p99']:.1f})" if times else ""
     left_out = f"; left out: {statistics.left_out}" if statistics.left_out else ""
-    print(
-        f"{statistics.scans} scans, {statistics.points} points, {statistics.counted} count{left_out}{spent}"
-    )
+    read = f"{counted(statistics.scans, 'scan')}, {counted(statistics.points, 'point')}"
+    print(f"{read}, {statistics.counted:,} of them used{left_out}{spent}")
     print(f"live map {live.name}: {usage_text(usage)}; {states_text(chunks)}")
 
 

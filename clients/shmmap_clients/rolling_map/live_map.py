@@ -8,18 +8,20 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shmmap import Box, DaemonUnreachable
 from shmmap.errors import LiveInterrupted, OverBudget
-from shmmap.live import ChunkInfo, LiveMap, LiveMapper, LiveMapRow, ScanCounts
-from shmmap_clients.scans.scan_sequence import Scan
+from shmmap.live import ChunkInfo, LiveMap, LiveMapRow, ScanCounts
+from shmmap_clients.command_line import counted, format_bytes
 from shmmap_clients.spread import Decimated, RunningSpread
 
-__all__ = ["DriveStatistics", "MappedScan", "all_voxels", "map_scan", "states_text", "usage_text"]
+if TYPE_CHECKING:
+    from shmmap.live import LiveMapper  # needs numba, which readers do without
+    from shmmap_clients.scans.scan_sequence import Scan
 
 _SIDE: Final = 64  # side of a chunk, voxels
 
@@ -118,8 +120,8 @@ class DriveStatistics:
         counts = {name: getattr(mapped.counts, name) for name in ScanCounts.__struct_fields__}
         left_out = _left_out(counts)
         return (
-            f"{mapped.scan.name}: {len(mapped.scan.xyz)} points, {counts['near']} in range,"
-            f" {counts['far']} beyond"
+            f"{mapped.scan.name}: {len(mapped.scan.xyz):,} points, {counts['near']:,} in range,"
+            f" {counts['far']:,} beyond"
             + (f", {left_out}" if left_out else "")
             + f"; {mapped.add_s * 1e3:.1f} ms"
             + (f", {mapped.on_their_way} on their way" if mapped.on_their_way > 1 else "")
@@ -141,10 +143,10 @@ class DriveStatistics:
 
 
 def usage_text(usage: LiveMapRow) -> str:
-    """Return the size of a map as text: 1 234 567 active cells, 12.3 MB, 27 chunks."""
-    waiting = f", {usage.waiting_bytes / 1e6:.1f} MB waiting" if usage.waiting_bytes else ""
-    active = f"{usage.active:,}".replace(",", " ")
-    return f"{active} active cells, {usage.bytes / 1e6:.1f} MB, {usage.chunks} chunks{waiting}"
+    """Return the size of a map as text: ``1,234,567 voxels known, 11.8 MiB, 27 chunks``."""
+    waiting = f", {format_bytes(usage.waiting_bytes)} waiting" if usage.waiting_bytes else ""
+    chunks = counted(usage.chunks, "chunk")
+    return f"{counted(usage.active, 'voxel')} known, {format_bytes(usage.bytes)}, {chunks}{waiting}"
 
 
 def _usage_now(live: LiveMap) -> str:
@@ -158,12 +160,12 @@ def _usage_now(live: LiveMap) -> str:
 def states_text(chunks: Sequence[ChunkInfo]) -> str:
     """Return the number of chunks in each state as text, most frequent first."""
     states = Counter(row.state for row in chunks)
-    return ", ".join(f"{count} {state}" for state, count in states.most_common())
+    return ", ".join(f"{count:,} {state}" for state, count in states.most_common())
 
 
 def _left_out(counts: Counter[str] | dict[str, int]) -> str:
     reasons = (("too_near", "too near"), ("outside_z", "too low or high"), ("not_finite", "not finite"))
-    return ", ".join(f"{counts[name]} {words}" for name, words in reasons if counts[name])
+    return ", ".join(f"{counts[name]:,} {words}" for name, words in reasons if counts[name])
 
 
 def all_voxels(live: LiveMap, kind: str, scope: str = "memory") -> NDArray[np.float64]:

@@ -16,8 +16,6 @@ import yaml
 
 from shmmap.errors import ConfigError, MapMissing
 
-__all__ = ["Entry", "Value", "read_parameter_file"]
-
 Value: TypeAlias = bool | float | str | None
 
 _ROS: Final = "ros__parameters"

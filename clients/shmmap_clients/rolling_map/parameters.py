@@ -21,8 +21,6 @@ from shmmap.errors import ConfigError
 from shmmap.live import LiveMap, Occupancy, ScanFilter
 from shmmap_clients.rolling_map.parameter_file import Entry, Value, read_parameter_file
 
-__all__ = ["LiveSettings", "Parameters", "Shown", "live_section", "read_parameters"]
-
 _NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _FRAME_BYTES: Final = 40  # bytes of the frame in a chunk's header
 _VERSION_2: Final = {

@@ -14,8 +14,6 @@ from shmmap.formats.png import png_bytes
 from shmmap.formats.svg import PALE, Axes, BoxTuple, Page, dash, element, swatch
 from shmmap.live import ChunkInfo
 
-__all__ = ["STATES", "HeightColours", "MapContent", "map_picture"]
-
 _CHUNK_SIDE: Final = 64
 _WIDTH_PX: Final = 1200.0
 _HIGH_PX: Final = 1100.0  # greatest height of the view from above

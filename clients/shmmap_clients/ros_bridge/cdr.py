@@ -8,13 +8,13 @@ its length including a closing zero byte, then its bytes.  A sequence is its len
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterable
-from typing import Final
+from collections.abc import Callable, Iterable, Mapping
+from functools import lru_cache, partial
+from typing import Any, Final
 
-__all__ = ["MAX_BYTES", "CdrWriter", "Content", "copy_into"]
+from numpy.typing import NDArray
 
-MAX_BYTES: Final = 2**31 - 1
-"""Largest sample that CycloneDDS sends (``Internal/MaxSampleSize``), 2 GiB; its lengths have 32 bits."""
+from shmmap_clients.ros_cells import MAX_BYTES, CloudLayout, cloud_layout, fill_rows
 
 _ENCAPSULATION: Final = b"\x00\x01\x00\x00"  # CDR_LE, no options
 
@@ -123,3 +123,54 @@ class CdrWriter:
                 with whole[4 + start : 4 + start + nbytes] as place:
                     fill(place)
         return made
+
+
+def write_cloud(
+    writer: CdrWriter,
+    columns: Mapping[str, NDArray[Any]],
+    origin: tuple[float, float, float],
+    frame_id: str = "",
+    stamp_ns: int = 0,
+) -> None:
+    """Append a ``PointCloud2``; inside a cell, its header is empty, as in Autoware.
+
+    Parameters
+    ----------
+    columns
+        Columns of equal lengths; they are read when the message is assembled.
+    origin
+        Origin of ``xyz``, metres.
+    frame_id, stamp_ns
+        Frame and time of the header, nanoseconds since 1970.
+    """
+    layout, points = cloud_layout(columns), len(columns["xyz"])
+    write_cloud_head(writer, layout, points, frame_id, stamp_ns)
+    if points:
+        fill = partial(fill_rows, columns=columns, origin=origin, layout=layout)
+        writer.blob(points * layout.point_step, fill)
+    writer.numbers("?", True)  # is_dense: every coordinate is finite
+
+
+def write_cloud_head(
+    writer: CdrWriter, layout: CloudLayout, points: int, frame_id: str = "", stamp_ns: int = 0
+) -> None:
+    """Append the part before the points: header, size, fields, and the number of their bytes."""
+    writer.numbers("iI", stamp_ns // 10**9, stamp_ns % 10**9)
+    writer.text(frame_id)
+    writer.numbers("II", 1, points)  # height, width
+    writer.prepared(_described(layout.fields, layout.point_step))
+    writer.numbers("II", layout.point_step * points, layout.point_step * points)  # row_step, data's length
+
+
+@lru_cache(maxsize=64)
+def _described(fields: tuple[tuple[str, int, int, int], ...], point_step: int) -> bytes:
+    """Return the fields of a cloud as bytes of its message, to be aligned to four."""
+    writer = CdrWriter()
+    writer.numbers("I", len(fields))
+    for name, start, datatype, count in fields:
+        writer.text(name)
+        writer.numbers("IB", start, datatype)
+        writer.numbers("I", count)
+    writer.numbers("?", False)  # is_bigendian
+    writer.numbers("I", point_step)
+    return bytes(writer.content()[4:])

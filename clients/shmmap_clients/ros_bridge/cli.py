@@ -8,6 +8,7 @@ import os
 import signal
 import sys
 from collections.abc import Sequence
+from datetime import datetime
 from typing import TYPE_CHECKING, Any, Final
 
 from shmmap_clients.command_line import (
@@ -21,8 +22,6 @@ from shmmap_clients.command_line import (
 
 if TYPE_CHECKING:
     from shmmap import Client
-
-__all__ = ["main"]
 
 _NAME: Final = "shmmap-ros-bridge"
 _GB: Final = 10**9
@@ -38,8 +37,10 @@ Names, in the namespace unless they begin with a slash; --name WHAT=NAME changes
   live           /shmmap/live: of a live map the services get_occupied_voxels, get_free_voxels (in memory),
                  get_saved_occupied_voxels, get_saved_free_voxels (on disk), and the topics
                  occupied_voxels, free_voxels
-and the six parameter services of the node.  CYCLONEDDS_URI and ROS_LOCALHOST_ONLY count as they do for nodes.
-Nodes have to run with RMW_IMPLEMENTATION=rmw_cyclonedds_cpp: `shmmap doctor` names those that do not.
+and the six parameter services of the node.  CYCLONEDDS_URI, ROS_AUTOMATIC_DISCOVERY_RANGE, ROS_STATIC_PEERS
+and ROS_LOCALHOST_ONLY count as they do for nodes.  Nodes have to run with
+RMW_IMPLEMENTATION=rmw_cyclonedds_cpp: `shmmap doctor` names those that do not.
+Where ROS 2 is installed, use the node instead, shmmap-ros-node: it serves every implementation.
 Ends with SIGTERM or Ctrl-C.
 Exit code: 0; 2 a name, or the whole map is too large; 69 no daemon; 71 DDS does not start; 75 another bridge
 of this daemon runs in this domain."""
@@ -89,6 +90,11 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         default=30.0,
         metavar="SECONDS",
         help="how long cells of a request may take to load; what is missing then is left out (default: 30)",
+    )
+    parser.add_argument(
+        "--plain-ids",
+        action="store_true",
+        help="ids of cells are those of Autoware, without versions: changed cells are not sent again",
     )
     parser.add_argument(
         "--whole-map",
@@ -150,6 +156,7 @@ def _run(args: argparse.Namespace) -> int:
         namespace=args.namespace,
         names=dict(args.name),
         wait_s=args.wait,
+        plain_ids=args.plain_ids,
         whole_map=args.whole_map,
         whole_bytes=min(int(args.whole_map_limit * _GB), 2**31 - 1),
         voxels_every_s=args.voxels_every,
@@ -189,5 +196,5 @@ def _live_map(args: argparse.Namespace, client: Client) -> str:
 
 
 def _log(text: str, *_: Any) -> None:
-    print_line(f"{_NAME}: {text}", file=sys.stderr)
+    print_line(f"{datetime.now():%Y-%m-%d %H:%M:%S} {_NAME}: {text}", file=sys.stderr)
     sys.stderr.flush()

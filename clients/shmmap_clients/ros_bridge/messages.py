@@ -16,32 +16,9 @@ import struct
 from dataclasses import dataclass
 from typing import Any, Final, TypeVar
 
-from cyclonedds.idl import IdlStruct, make_idl_struct
+from cyclonedds.idl import make_idl_struct
 from cyclonedds.idl.annotations import final
 from cyclonedds.idl.types import float32, float64, int32, int64, sequence, uint8, uint32, uint64
-
-__all__ = [
-    "DIFFERENTIAL",
-    "FREE",
-    "OCCUPIED",
-    "PARTIAL",
-    "SELECTED",
-    "AreaInfo",
-    "CellMetaData",
-    "CellMetaDataWithID",
-    "CellWithID",
-    "Damaged",
-    "Header",
-    "MapMetaData",
-    "PointCloud2",
-    "PointField",
-    "ServiceKind",
-    "Time",
-    "VoxelGrid",
-    "ready_made",
-    "sample",
-    "service",
-]
 
 _Sample = TypeVar("_Sample")
 
@@ -59,15 +36,24 @@ class Damaged:
     reason: str
 
 
-def sample(kind: type[_Sample]) -> type[_Sample]:
-    """Class decorator: a dataclass that may be sent as prepared bytes, and tolerates invalid ones received.
+def message(name: str, /, **fields: Any) -> type[Any]:
+    """Return the class of a message, that may be sent as prepared bytes and tolerates invalid ones received.
 
     The layout is that of all ROS types: fields one after another, without extensions (``final``).
+
+    Parameters
+    ----------
+    name
+        Name in ROS notation, ``sensor_msgs/msg/PointCloud2``.
+    fields
+        Types of the fields, in order.
     """
-    kind.serialize = _serialize  # type: ignore[attr-defined]
-    kind.deserialize = classmethod(_deserialize)  # type: ignore[attr-defined]
-    kind.ready = None  # type: ignore[attr-defined]  # no annotation, so that it is no field of the message
-    return dataclass(final(kind))  # type: ignore[no-any-return]
+    package, folder, kind = name.split("/")
+    made: type[Any] = make_idl_struct(kind, f"{package}::{folder}::dds_::{kind}_", fields, dataclassify=False)
+    made.serialize = _serialize
+    made.deserialize = classmethod(_deserialize)
+    made.ready = None  # no annotation, so that it is no field of the message
+    return dataclass(final(made))  # type: ignore[no-any-return]
 
 
 def _serialize(
@@ -118,102 +104,68 @@ def service(name: str, request: dict[str, Any], reply: dict[str, Any]) -> Servic
     request, reply
         Types of the messages' further fields, by name.
     """
-    package, _, kind = name.split("/")
     head = {"client": uint64, "number": int64}
-
-    def message(part: str, fields: dict[str, Any]) -> type[Any]:
-        typename = f"{package}::srv::dds_::{kind}_{part}_"
-        return sample(make_idl_struct(f"{kind}_{part}", typename, head | fields, dataclassify=False))
-
-    return ServiceKind(message("Request", request), message("Response", reply))
+    return ServiceKind(
+        message(f"{name}_Request", **head, **request), message(f"{name}_Response", **head, **reply)
+    )
 
 
-@sample
-class Time(IdlStruct, typename="builtin_interfaces::msg::dds_::Time_"):
-    """A point in time: seconds and nanoseconds since 1970."""
+Time: Final = message("builtin_interfaces/msg/Time", sec=int32, nanosec=uint32)
+"""A point in time: seconds and nanoseconds since 1970."""
 
-    sec: int32
-    nanosec: uint32
+Header: Final = message("std_msgs/msg/Header", stamp=Time, frame_id=str)
+"""Time and frame of a message."""
 
+PointField: Final = message(
+    "sensor_msgs/msg/PointField", name=str, offset=uint32, datatype=uint8, count=uint32
+)
+"""One field of each point: offset in bytes, type (1 int8 to 8 float64), number of values."""
 
-@sample
-class Header(IdlStruct, typename="std_msgs::msg::dds_::Header_"):
-    """Time and frame of a message."""
+PointCloud2: Final = message(
+    "sensor_msgs/msg/PointCloud2",
+    header=Header,
+    height=uint32,
+    width=uint32,
+    fields=sequence[PointField],
+    is_bigendian=bool,
+    point_step=uint32,
+    row_step=uint32,
+    data=sequence[uint8],
+    is_dense=bool,
+)
+"""Points as bytes: ``width`` x ``height`` of ``point_step`` bytes each."""
 
-    stamp: Time
-    frame_id: str
+AreaInfo: Final = message(
+    "autoware_map_msgs/msg/AreaInfo", center_x=float32, center_y=float32, radius=float32
+)
+"""An area around a position, metres, map frame."""
 
+CellMetaData: Final = message(
+    "autoware_map_msgs/msg/PointCloudMapCellMetaData",
+    min_x=float32,
+    min_y=float32,
+    max_x=float32,
+    max_y=float32,
+)
+"""A cell's box, metres in the map frame."""
 
-@sample
-class PointField(IdlStruct, typename="sensor_msgs::msg::dds_::PointField_"):
-    """One field of each point: offset in bytes, type (1 int8 to 8 float64), number of values."""
+CellMetaDataWithID: Final = message(
+    "autoware_map_msgs/msg/PointCloudMapCellMetaDataWithID", cell_id=str, metadata=CellMetaData
+)
+"""A cell without its points."""
 
-    name: str
-    offset: uint32
-    datatype: uint8
-    count: uint32
+CellWithID: Final = message(
+    "autoware_map_msgs/msg/PointCloudMapCellWithID",
+    cell_id=str,
+    pointcloud=PointCloud2,
+    metadata=CellMetaData,
+)
+"""A cell with its points."""
 
-
-@sample
-class PointCloud2(IdlStruct, typename="sensor_msgs::msg::dds_::PointCloud2_"):
-    """Points as bytes: ``width`` x ``height`` of ``point_step`` bytes each."""
-
-    header: Header
-    height: uint32
-    width: uint32
-    fields: sequence[PointField]
-    is_bigendian: bool
-    point_step: uint32
-    row_step: uint32
-    data: sequence[uint8]
-    is_dense: bool
-
-
-@sample
-class AreaInfo(IdlStruct, typename="autoware_map_msgs::msg::dds_::AreaInfo_"):
-    """An area around a position, metres, map frame."""
-
-    center_x: float32
-    center_y: float32
-    radius: float32
-
-
-@sample
-class CellMetaData(IdlStruct, typename="autoware_map_msgs::msg::dds_::PointCloudMapCellMetaData_"):
-    """A cell's box, metres in the map frame."""
-
-    min_x: float32
-    min_y: float32
-    max_x: float32
-    max_y: float32
-
-
-@sample
-class CellMetaDataWithID(
-    IdlStruct, typename="autoware_map_msgs::msg::dds_::PointCloudMapCellMetaDataWithID_"
-):
-    """A cell without its points."""
-
-    cell_id: str
-    metadata: CellMetaData
-
-
-@sample
-class CellWithID(IdlStruct, typename="autoware_map_msgs::msg::dds_::PointCloudMapCellWithID_"):
-    """A cell with its points."""
-
-    cell_id: str
-    pointcloud: PointCloud2
-    metadata: CellMetaData
-
-
-@sample
-class MapMetaData(IdlStruct, typename="autoware_map_msgs::msg::dds_::PointCloudMapMetaData_"):
-    """All cells of the map, without their points."""
-
-    header: Header
-    metadata_list: sequence[CellMetaDataWithID]
-
+MapMetaData: Final = message(
+    "autoware_map_msgs/msg/PointCloudMapMetaData", header=Header, metadata_list=sequence[CellMetaDataWithID]
+)
+"""All cells of the map, without their points."""
 
 _CELLS: Final = {"header": Header, "new_pointcloud_with_ids": sequence[CellWithID]}
 
@@ -235,22 +187,22 @@ SELECTED: Final = service(
 """Cells with these ids, in the order of the request."""
 
 
-@sample
-class VoxelGrid(IdlStruct, typename="bonxai_msgs::msg::dds_::VoxelGrid_"):
-    """Voxels by their indices, ``floor(position / resolution)`` along each axis, and the box around them."""
-
-    header: Header
-    resolution: float64
-    x: sequence[int32]
-    y: sequence[int32]
-    z: sequence[int32]
-    num_voxels: uint32
-    min_x: int32
-    min_y: int32
-    min_z: int32
-    max_x: int32
-    max_y: int32
-    max_z: int32
+VoxelGrid: Final = message(
+    "bonxai_msgs/msg/VoxelGrid",
+    header=Header,
+    resolution=float64,
+    x=sequence[int32],
+    y=sequence[int32],
+    z=sequence[int32],
+    num_voxels=uint32,
+    min_x=int32,
+    min_y=int32,
+    min_z=int32,
+    max_x=int32,
+    max_y=int32,
+    max_z=int32,
+)
+"""Voxels by their indices, ``floor(position / resolution)`` along each axis, and the box around them."""
 
 
 def _voxel_service(name: str, count: str) -> ServiceKind:

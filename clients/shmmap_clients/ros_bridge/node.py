@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """`RosBridge`: the node ``pointcloud_map_loader`` of a ROS 2 system, which serves the daemon's map.
 
-Three threads: one answers with cells, one with voxels if there is a live map, and one with parameters.
-Each thread takes its own requests. The last one also updates the list of present clients every second.
+Four threads: one answers with cells, one with voxels if there is a live map, one with parameters, and one
+follows the daemon's events.  The first three take their own requests; the third also updates the list of
+present clients every second.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from queue import SimpleQueue
 from types import TracebackType
-from typing import Final, TypeVar
+from typing import Final
 
 import msgspec
 from cyclonedds.pub import DataWriter
@@ -23,7 +24,6 @@ from cyclonedds.topic import Topic
 
 from shmmap import Client
 from shmmap.live import LiveMap
-from shmmap_clients.ros_bridge.cdr import MAX_BYTES
 from shmmap_clients.ros_bridge.live_worker import LIVE_SERVICES, LiveWorker
 from shmmap_clients.ros_bridge.map_worker import MapWorker
 from shmmap_clients.ros_bridge.messages import (
@@ -45,9 +45,9 @@ from shmmap_clients.ros_bridge.participant import (
 )
 from shmmap_clients.ros_bridge.service_server import Listening, Requester, ServiceServer
 from shmmap_clients.ros_bridge.status_file import StatusFile
+from shmmap_clients.ros_bridge.type_hashes import type_hash
 from shmmap_clients.ros_bridge.worker import Worker
-
-__all__ = ["NAMES", "BridgeSettings", "RosBridge"]
+from shmmap_clients.ros_cells import MAX_BYTES, follow_events
 
 NAMES: Final[Mapping[str, str]] = {
     "partial": "get_partial_pointcloud_map",
@@ -60,10 +60,8 @@ NAMES: Final[Mapping[str, str]] = {
 """Default names of services and topics in the node's namespace; `BridgeSettings.names` overrides them."""
 _KINDS: Final = {"partial": PARTIAL, "differential": DIFFERENTIAL, "selected": SELECTED}
 _LOOK_S: Final = 1.0
-_ADVICE: Final = "start it with RMW_IMPLEMENTATION=rmw_cyclonedds_cpp"
+_ADVICE: Final = "use shmmap-ros-node, or start it with RMW_IMPLEMENTATION=rmw_cyclonedds_cpp"
 _MAX_LISTED: Final = 32
-
-_Self = TypeVar("_Self", bound="RosBridge")
 
 
 class BridgeSettings(msgspec.Struct, frozen=True):
@@ -79,6 +77,8 @@ class BridgeSettings(msgspec.Struct, frozen=True):
         Names that override those of `NAMES`.
     wait_s
         Time for cells to load, seconds.
+    plain_ids
+        Whether cells have ids without versions, as from Autoware's map loader.
     whole_map, whole_bytes
         Whether to publish the whole map, and its largest size.
     voxels_every_s
@@ -90,6 +90,7 @@ class BridgeSettings(msgspec.Struct, frozen=True):
     namespace: str = "/map"
     names: Mapping[str, str] = {}
     wait_s: float = 30.0
+    plain_ids: bool = False
     whole_map: bool = False
     whole_bytes: int = MAX_BYTES
     voxels_every_s: float = 1.0
@@ -133,6 +134,7 @@ class RosBridge:
         live: LiveMap | None = None,
     ) -> None:
         self._settings = settings
+        self._endpoint = client.endpoint
         self._log = log
         self._stop = threading.Event()
         self._ended: SimpleQueue[None] = SimpleQueue()  # an event's lock may be held where a signal arrives
@@ -154,6 +156,7 @@ class RosBridge:
                 Listening(self._participant, log),
                 wait_s=settings.wait_s,
                 whole_bytes=settings.whole_bytes,
+                plain_ids=settings.plain_ids,
                 stop=self._stop,
                 log=log,
             )
@@ -181,7 +184,7 @@ class RosBridge:
             self._write_status()
             self._undo = undo.pop_all()
 
-    def __enter__(self: _Self) -> _Self:
+    def __enter__(self) -> RosBridge:
         return self
 
     def __exit__(
@@ -195,9 +198,10 @@ class RosBridge:
 
     def run(self) -> None:
         """Serve until `stop` is called."""
-        with ThreadPoolExecutor(1 + len(self._workers)) as threads:
+        with ThreadPoolExecutor(2 + len(self._workers)) as threads:
             runs: list[Future[None]] = [
                 threads.submit(self._answer_parameters),
+                threads.submit(follow_events, self._endpoint, self._stop, self._map.notify),
                 *(threads.submit(one.run) for one in self._workers),
             ]
             for one in runs:
@@ -221,10 +225,6 @@ class RosBridge:
     def _all_listening(self) -> list[Listening]:
         return [self._listening, *(worker.listening for worker in self._workers)]
 
-    @property
-    def _servers(self) -> list[ServiceServer]:
-        return [server for one in self._all_listening for server in one.servers]
-
     def _add(self, name: str, kind: ServiceKind, listening: Listening) -> None:
         self._ids += 1
         number = self._id + self._ids.to_bytes(4, "big")
@@ -232,11 +232,11 @@ class RosBridge:
         listening.add(ServiceServer(self._participant, name, kind, service_id))
 
     def _latched(self, name: str, kind: type) -> DataWriter:
-        qos = endpoint_qos(depth=1, latched=True)
+        qos = endpoint_qos(type_hash(kind), depth=1, latched=True)
         return DataWriter(self._participant, Topic(self._participant, topic(name), kind), qos)
 
     def _add_live(self, live: LiveMap, place: str) -> None:
-        qos = endpoint_qos(depth=1)
+        qos = endpoint_qos(type_hash(PointCloud2), depth=1)
         clouds = {
             kind: DataWriter(
                 self._participant,
@@ -254,7 +254,7 @@ class RosBridge:
             log=self._log,
         )
         self._workers.append(worker)
-        for name, (kind, _, _) in LIVE_SERVICES.items():
+        for name, kind in LIVE_SERVICES.items():
             self._add(f"{place}/{name}", kind, worker.listening)
 
     # --- requests -----------------------------------------------------------------------------------
@@ -265,8 +265,10 @@ class RosBridge:
             self._listening.wait(_LOOK_S)
             for request in self._listening.take():
                 server = request.server
-                fields = self._parameters.reply(server.name.rpartition("/")[2], request.message)
-                if server.present(request) and (why := server.reply_fields(request, **fields)):
+                asked = request.message
+                fields = self._parameters.reply(server.name.rpartition("/")[2], asked)
+                reply = server.kind.reply(client=asked.client, number=asked.number, **fields)
+                if server.present(request) and (why := server.reply(reply)):
                     self._log(f"{server.name}: an answer was not sent: {why}")
             if time.monotonic() >= look_s:
                 self._look()
@@ -274,8 +276,8 @@ class RosBridge:
 
     def _look(self) -> None:
         """Update the list of present clients."""
-        clients = [(server, one) for server in self._servers for one in server.requesters()]
-        self._map.alive = frozenset(one.name for _, one in clients)
+        servers = [server for one in self._all_listening for server in one.servers]
+        clients = [(server, one) for server in servers for one in server.requesters()]
         self._incompatible.look(clients)
         self._write_status(len({one.name for _, one in clients}))
 
@@ -285,7 +287,6 @@ class RosBridge:
                 "domain": self._settings.domain,
                 "node": resolved(self._settings.node, self._settings.namespace),
                 "clients": clients,
-                "remembered": self._map.requesters,
                 "incompatible": self._incompatible.now,
             }
         )

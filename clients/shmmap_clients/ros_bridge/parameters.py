@@ -8,23 +8,9 @@ reads ``enable_partial_load`` to choose between the service and the topic.
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-from cyclonedds.idl import IdlStruct
 from cyclonedds.idl.types import float64, int64, sequence, uint8, uint64
 
-from shmmap_clients.ros_bridge.messages import ServiceKind, sample, service
-
-__all__ = [
-    "PARAMETER_SERVICES",
-    "FloatingPointRange",
-    "IntegerRange",
-    "ListParametersResult",
-    "Parameter",
-    "ParameterDescriptor",
-    "ParameterValue",
-    "Parameters",
-    "SetParametersResult",
-    "Value",
-]
+from shmmap_clients.ros_bridge.messages import ServiceKind, message, service
 
 Value = bool | float | str | list[str]
 _BOOL, _DOUBLE, _STRING, _STRING_ARRAY = 1, 3, 4, 9  # rcl_interfaces/msg/ParameterType
@@ -33,77 +19,70 @@ _NOT_DECLARED: Final = "parameter '{}' cannot be set because it was not declared
 _READ_ONLY: Final = "parameter '{}' cannot be set because it is read-only"
 _SOME_NOT_DECLARED: Final = "One or more parameters were not declared before setting"
 
+ParameterValue: Final = message(
+    "rcl_interfaces/msg/ParameterValue",
+    type=uint8,
+    bool_value=bool,
+    integer_value=int64,
+    double_value=float64,
+    string_value=str,
+    byte_array_value=sequence[uint8],
+    bool_array_value=sequence[bool],
+    integer_array_value=sequence[int64],
+    double_array_value=sequence[float64],
+    string_array_value=sequence[str],
+)
+"""A value of one type: 0 not set, 1 bool, 2 integer, 3 double, 4 string, 5 to 9 arrays (5: of bytes)."""
 
-@sample
-class ParameterValue(IdlStruct, typename="rcl_interfaces::msg::dds_::ParameterValue_"):
-    """A value of one type: 0 not set, 1 bool, 2 integer, 3 double, 4 string, 5 to 9 arrays (5: of bytes)."""
+Parameter: Final = message(
+    "rcl_interfaces/msg/Parameter",
+    name=str,
+    value=ParameterValue,
+)
+"""A parameter."""
 
-    type: uint8
-    bool_value: bool
-    integer_value: int64
-    double_value: float64
-    string_value: str
-    byte_array_value: sequence[uint8]
-    bool_array_value: sequence[bool]
-    integer_array_value: sequence[int64]
-    double_array_value: sequence[float64]
-    string_array_value: sequence[str]
+FloatingPointRange: Final = message(
+    "rcl_interfaces/msg/FloatingPointRange",
+    from_value=float64,
+    to_value=float64,
+    step=float64,
+)
+"""Range of allowed numbers."""
 
+IntegerRange: Final = message(
+    "rcl_interfaces/msg/IntegerRange",
+    from_value=int64,
+    to_value=int64,
+    step=uint64,
+)
+"""Range of allowed whole numbers."""
 
-@sample
-class Parameter(IdlStruct, typename="rcl_interfaces::msg::dds_::Parameter_"):
-    """A parameter."""
+ParameterDescriptor: Final = message(
+    "rcl_interfaces/msg/ParameterDescriptor",
+    name=str,
+    type=uint8,
+    description=str,
+    additional_constraints=str,
+    read_only=bool,
+    dynamic_typing=bool,
+    floating_point_range=sequence[FloatingPointRange, 1],
+    integer_range=sequence[IntegerRange, 1],
+)
+"""Description of a parameter."""
 
-    name: str
-    value: ParameterValue
+SetParametersResult: Final = message(
+    "rcl_interfaces/msg/SetParametersResult",
+    successful=bool,
+    reason=str,
+)
+"""Whether a parameter was set, and if not, the reason."""
 
-
-@sample
-class FloatingPointRange(IdlStruct, typename="rcl_interfaces::msg::dds_::FloatingPointRange_"):
-    """Range of allowed numbers."""
-
-    from_value: float64
-    to_value: float64
-    step: float64
-
-
-@sample
-class IntegerRange(IdlStruct, typename="rcl_interfaces::msg::dds_::IntegerRange_"):
-    """Range of allowed whole numbers."""
-
-    from_value: int64
-    to_value: int64
-    step: uint64
-
-
-@sample
-class ParameterDescriptor(IdlStruct, typename="rcl_interfaces::msg::dds_::ParameterDescriptor_"):
-    """Description of a parameter."""
-
-    name: str
-    type: uint8
-    description: str
-    additional_constraints: str
-    read_only: bool
-    dynamic_typing: bool
-    floating_point_range: sequence[FloatingPointRange, 1]
-    integer_range: sequence[IntegerRange, 1]
-
-
-@sample
-class SetParametersResult(IdlStruct, typename="rcl_interfaces::msg::dds_::SetParametersResult_"):
-    """Whether a parameter was set, and if not, the reason."""
-
-    successful: bool
-    reason: str
-
-
-@sample
-class ListParametersResult(IdlStruct, typename="rcl_interfaces::msg::dds_::ListParametersResult_"):
-    """Names of parameters, and their prefixes."""
-
-    names: sequence[str]
-    prefixes: sequence[str]
+ListParametersResult: Final = message(
+    "rcl_interfaces/msg/ListParametersResult",
+    names=sequence[str],
+    prefixes=sequence[str],
+)
+"""Names of parameters, and their prefixes."""
 
 
 _NAMES: Final = {"names": sequence[str]}
@@ -191,7 +170,7 @@ class Parameters:
         """Return the names, or none if one is unknown, for which rclcpp returns an empty answer."""
         return names if all(name in self._values for name in names) else ()
 
-    def _value(self, name: str) -> ParameterValue:
+    def _value(self, name: str) -> Any:
         value = self._values[name]
         return ParameterValue(
             type=_TYPES[type(value)],
@@ -206,7 +185,7 @@ class Parameters:
             string_array_value=value if isinstance(value, list) else [],
         )
 
-    def _descriptor(self, name: str) -> ParameterDescriptor:
+    def _descriptor(self, name: str) -> Any:
         return ParameterDescriptor(
             name=name,
             type=_TYPES[type(self._values[name])],
@@ -221,7 +200,7 @@ class Parameters:
     def _refusal(self, name: str) -> str:
         return (_READ_ONLY if name in self._values else _NOT_DECLARED).format(name)
 
-    def _listed(self, prefixes: Sequence[str], depth: int) -> ListParametersResult:
+    def _listed(self, prefixes: Sequence[str], depth: int) -> Any:
         """Return the names below prefixes, at most ``depth`` parts down (0: all), as rclcpp lists them."""
 
         def near(rest: str) -> bool:

@@ -2,7 +2,8 @@
 """The bridge's participant in a DDS domain: names, settings of CycloneDDS, quality of service, closing.
 
 ROS names become DDS names by the mangling of ``rmw``.  The user's settings (``CYCLONEDDS_URI``,
-``ROS_LOCALHOST_ONLY``) have the same effect as for ROS nodes.
+``ROS_AUTOMATIC_DISCOVERY_RANGE``, ``ROS_STATIC_PEERS``, ``ROS_LOCALHOST_ONLY``) have the same effect as for
+nodes of rmw_cyclonedds_cpp.
 
 All clients of a service read the same topic. A writer keeps its last samples (ten replies), and so never
 waits for a reader that has stopped: this reader misses replaced samples, others are not affected.
@@ -14,6 +15,7 @@ import os
 import re
 from collections.abc import Mapping
 from typing import Any, Final
+from xml.sax.saxutils import quoteattr
 
 from cyclonedds.core import DDSException
 from cyclonedds.domain import Domain, DomainParticipant
@@ -21,29 +23,29 @@ from cyclonedds.qos import Policy, Qos
 from cyclonedds.util import duration
 
 from shmmap import BadRequest
-from shmmap.errors import CannotStart
-
-__all__ = [
-    "MAX_DOMAIN",
-    "close",
-    "endpoint_qos",
-    "node_name",
-    "open_participant",
-    "reply_topic",
-    "request_topic",
-    "resolved",
-    "settings",
-    "topic",
-]
+from shmmap.errors import CannotStart, ConfigError
 
 _NAME: Final = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 _MOST: Final = 200  # DDS allows 255, including a prefix, a suffix and the parameter services' part
 MAX_DOMAIN: Final = 232
 """Highest domain number with valid UDP ports."""
-_LOCALHOST: Final = (
-    "<CycloneDDS><Domain Id='any'><General><Interfaces><NetworkInterface address='127.0.0.1'/></Interfaces>"
-    "</General></Domain></CycloneDDS>"
+_DOMAIN: Final = "<CycloneDDS><Domain Id='any'>{}</Domain></CycloneDDS>"
+_LOCALHOST: Final = "<General><Interfaces><NetworkInterface address='127.0.0.1'/></Interfaces></General>"
+_NEAR: Final = (
+    "<General><AllowMulticast>false</AllowMulticast><Interfaces>{}<NetworkInterface address='127.0.0.1'/>"
+    "</Interfaces></General>"
 )
+"""Jazzy's nodes announce themselves by loopback, which newer versions of CycloneDDS ignore by default."""
+_ANOTHER: Final = "<NetworkInterface autodetermine='true'/>"
+_NO_MULTICAST: Final = "<General><AllowMulticast>false</AllowMulticast></General>"
+_OFF: Final = (
+    "<Discovery><ParticipantIndex>none</ParticipantIndex><Tag>ros_discovery_off_{}</Tag></Discovery>"
+)
+_PEERS: Final = (
+    "<Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>"
+    "<Peers>{}</Peers></Discovery>"
+)
+_RANGES: Final = ("SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT")
 _BLOCKING_MS: Final = 100
 
 
@@ -98,10 +100,33 @@ def reply_topic(name: str) -> str:
 
 
 def settings(environ: Mapping[str, str] = os.environ) -> str:
-    """Return the configuration of CycloneDDS: settings from ROS first, so that the user's override them."""
-    localhost = [_LOCALHOST] if environ.get("ROS_LOCALHOST_ONLY") == "1" else []
+    """Return the configuration of CycloneDDS: settings from ROS first, so that the user's override them.
+
+    Raises
+    ------
+    ConfigError
+        ``ROS_AUTOMATIC_DISCOVERY_RANGE`` has an unknown value.
+    """
+    within = environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE") or "SUBNET"
+    if within not in _RANGES:
+        raise ConfigError(
+            f"{within!r} is none of {', '.join(_RANGES)}",
+            key="ROS_AUTOMATIC_DISCOVERY_RANGE",
+            origin="environment",
+        )
+    peers = [one for one in environ.get("ROS_STATIC_PEERS", "").split(";") if one]
+    ours = ""
+    if environ.get("ROS_LOCALHOST_ONLY") == "1":
+        ours = _LOCALHOST
+    elif within == "OFF":
+        ours = _NO_MULTICAST + _OFF.format(os.getpid())
+    elif within == "LOCALHOST" or (within == "SUBNET" and peers):
+        near = ["localhost"] if within == "LOCALHOST" else []
+        listed = "".join(f"<Peer address={quoteattr(one)}/>" for one in [*near, *peers])
+        ours = _NEAR.format(_ANOTHER if peers else "") if near else ""
+        ours += _PEERS.format(listed)
     users = environ.get("CYCLONEDDS_URI", "")
-    return ",".join([*localhost, *([users] if users else [])])
+    return ",".join([*([_DOMAIN.format(ours)] if ours else []), *([users] if users else [])])
 
 
 def open_participant(domain: int) -> tuple[Domain, DomainParticipant]:

@@ -36,11 +36,9 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
-from shmmap_clients.ros_bridge.cdr import Content
-from shmmap_clients.ros_bridge.messages import Damaged, ServiceKind, ready_made
+from shmmap_clients.ros_bridge.messages import Damaged, ServiceKind
 from shmmap_clients.ros_bridge.participant import endpoint_qos, reply_topic, request_topic
-
-__all__ = ["Listening", "Request", "Requester", "ServiceServer"]
+from shmmap_clients.ros_bridge.type_hashes import type_hash
 
 _KNOWN_AT_FIRST_S: Final = 1.0
 _KNOWN_WITHIN_S: Final = 0.1
@@ -90,12 +88,10 @@ class Request:
         The client, and the DDS handle of its writer.
     begun_s
         Time of the first attempt with a reachable daemon, on `time.monotonic`; 0: none yet.
-    was_requeued
-        Whether the request was put back, so that its client may have left since.
-    failed
-        Number of failures between which the daemon answered other requests.
-    answers
-        Number of the daemon's answers at the last failure.
+    was_tried
+        Whether there was an attempt, so that its client may have left since.
+    is_logged
+        Whether it was logged why it waits.
     """
 
     server: ServiceServer
@@ -103,9 +99,8 @@ class Request:
     requester: Requester
     handle: int
     begun_s: float = 0.0
-    was_requeued: bool = False
-    failed: int = 0
-    answers: int = -1
+    was_tried: bool = False
+    is_logged: bool = False
 
 
 class ServiceServer:
@@ -129,16 +124,15 @@ class ServiceServer:
         belongs = f"serviceid={service_id};"
         requests = Topic(participant, request_topic(name), kind.request)
         replies = Topic(participant, reply_topic(name), kind.reply)
-        self._reader = DataReader(participant, requests, endpoint_qos(belongs, depth=_KEPT))
-        self._writer = DataWriter(participant, replies, endpoint_qos(belongs))
+        self._reader = DataReader(
+            participant, requests, endpoint_qos(belongs + type_hash(kind.request), depth=_KEPT)
+        )
+        self._writer = DataWriter(participant, replies, endpoint_qos(belongs + type_hash(kind.reply)))
         self.condition = ReadCondition(self._reader, ViewState.Any | SampleState.NotRead | InstanceState.Any)
         self._lock = threading.Lock()  # one thread takes requests, another one replies
         self._requesters: dict[int, Requester] = {}  # by DDS handle of the writer of requests
         # clientid, or else participant, by DDS handle of the reader of replies
         self._readers: dict[int, str] = {}
-
-    def __repr__(self) -> str:
-        return f"<ServiceServer {self.name}>"
 
     def take(self) -> Iterator[Request | Damaged]:
         """Take the received requests; for an invalid message, the reason instead of a request."""
@@ -190,16 +184,8 @@ class ServiceServer:
         """Return whether the requesting client has left."""
         return self._requester(request.handle, refresh=True) is None
 
-    def reply(self, content: Content) -> str:
+    def reply(self, message: Any) -> str:
         """Send a reply; return an empty text, or the reason why it cannot be sent."""
-        return self._write(ready_made(self.kind.reply, content))
-
-    def reply_fields(self, request: Request, **fields: Any) -> str:
-        """Send a reply of these fields; return an empty text, or the reason why it cannot be sent."""
-        message = request.message
-        return self._write(self.kind.reply(client=message.client, number=message.number, **fields))
-
-    def _write(self, message: Any) -> str:
         try:
             self._writer.write(message)
         except DDSException as error:
@@ -277,9 +263,10 @@ class Listening:
     def wait(self, timeout_s: float) -> None:
         """Sleep until a request arrives, `wake` is called or the timeout expires."""
         self._waitset.wait(duration(nanoseconds=max(int(timeout_s * 1e9), 0)))
+        self._wake.set(False)
 
     def wake(self) -> None:
-        """End `wait`, and make all later calls return at once."""
+        """End `wait`, or the next one."""
         self._wake.set(True)
 
     def take(self) -> Iterator[Request]:

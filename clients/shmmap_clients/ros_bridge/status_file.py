@@ -21,8 +21,6 @@ from typing import Any, Final
 
 from shmmap.errors import Busy
 
-__all__ = ["StatusFile", "status_name"]
-
 _MODE: Final = 0o644
 
 

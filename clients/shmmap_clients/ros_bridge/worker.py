@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Workers that answer requests with data of the daemon, each in its own thread, with turns of clients.
 
-A ROS client waits without bound. So requests are kept while the daemon is away, and answered when it is back,
-unless the client has left. A request that takes long, or fails while others succeed, is put behind those of
-other clients, and dropped after some attempts. A request that the daemon refuses is logged and gets an empty
-answer. One whose answer is too large gets none, because the client would take an empty answer for a result.
+A ROS client waits without bound, and takes an empty answer for a result.  So requests are kept while the
+daemon is away or their cells are loading, and tried again after its next event, unless the client has left.
+Meanwhile other requests are answered.  A request that the daemon refuses is logged and gets an empty answer.
 """
 
 from __future__ import annotations
@@ -12,92 +11,56 @@ from __future__ import annotations
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Callable
 from typing import Any, Final
 
-from shmmap import BadRequest, DaemonUnreachable, ShmmapError, StaleHandle
-from shmmap.errors import Busy, LiveInterrupted, NoSession
+from shmmap import ShmmapError
 from shmmap_clients.ros_bridge.cdr import Content
+from shmmap_clients.ros_bridge.messages import ready_made
 from shmmap_clients.ros_bridge.service_server import Listening, Request
-
-__all__ = [
-    "MAX_PER_CLIENT",
-    "MAX_WAITING",
-    "StillLoading",
-    "TooLarge",
-    "WaitingRequests",
-    "Worker",
-    "no_followup",
-]
+from shmmap_clients.ros_cells import LATER, StillLoading
 
 MAX_PER_CLIENT: Final = 4
 """Largest number of waiting requests of one client; rclcpp nodes send one at a time."""
 MAX_WAITING: Final = 1024
-LATER: Final = (DaemonUnreachable, NoSession, Busy, LiveInterrupted, StaleHandle)
-"""Temporary errors, after which a request is tried again."""
 _AGAIN_S: Final = 0.2
-_MAX_FAILED: Final = 5
-"""Failed attempts at one request, while the daemon answers others, before it is dropped."""
-Answer = tuple[Content, Callable[[], None]]
+_PAUSES: Final = 2.0
+"""Pause after attempts in vain, as a multiple of their time: other requests come first."""
 
 
 class WaitingRequests:
-    """Fair queue for one thread; each round has one request of each waiting client."""
+    """Fair queue for one thread: clients take turns; one that waits comes behind all others."""
 
     def __init__(self) -> None:
-        self._queue: OrderedDict[int, tuple[int, Request]] = OrderedDict()  # with the round, by number
-        self._of: dict[str, list[int]] = {}  # numbers by client, oldest first
-        self._next = self._round = 0
+        self._of: OrderedDict[str, deque[Request]] = OrderedDict()  # by client, the next one first
 
     def __len__(self) -> int:
-        return len(self._queue)
+        return sum(map(len, self._of.values()))
 
     def put(self, request: Request) -> bool:
         """Append a request; return False if the queue is full.  Drop a client's oldest above its limit."""
-        mine = self._of.get(request.requester.name, ())
+        mine = self._of.setdefault(request.requester.name, deque())
         if len(mine) >= MAX_PER_CLIENT:
-            self._forget(mine[0])
-        if len(self._queue) >= MAX_WAITING:
+            mine.popleft()
+        elif len(self) >= MAX_WAITING:
             return False
-        last = self._queue[mine[-1]][0] + 1 if mine else self._round
-        self._append(max(last, self._round), request)
+        mine.append(request)
         return True
 
-    def requeue(self, request: Request) -> None:
-        """Put back a request that could not be answered yet, behind every other client."""
-        self._append(self._round + 1, request)
+    def put_back(self, request: Request) -> None:
+        """Put back a request that was taken before those of its client that wait; drop it above the limit."""
+        mine = self._of.setdefault(request.requester.name, deque())
+        if len(mine) < MAX_PER_CLIENT:
+            mine.appendleft(request)
 
     def get(self) -> Request:
         """Take the next request; the queue must not be empty."""
-        number = min(self._queue, key=lambda one: (self._queue[one][0], one))
-        self._round = self._queue[number][0]
-        return self._forget(number)
-
-    def _append(self, turn: int, request: Request) -> None:
-        self._next += 1
-        self._queue[self._next] = turn, request
-        self._of.setdefault(request.requester.name, []).append(self._next)
-
-    def _forget(self, number: int) -> Request:
-        _, request = self._queue.pop(number)
-        name = request.requester.name
-        self._of[name].remove(number)
-        if not self._of[name]:
-            del self._of[name]
+        name, mine = self._of.popitem(last=False)
+        request = mine.popleft()
+        if mine:
+            self._of[name] = mine
         return request
-
-
-def no_followup() -> None:
-    """Do nothing after an answer has been sent."""
-
-
-class StillLoading(Exception):
-    """Cells are still being loaded: other clients' requests come first."""
-
-
-class TooLarge(BadRequest):
-    """The requested data do not fit into one answer."""
 
 
 class Worker(ABC):
@@ -120,15 +83,16 @@ class Worker(ABC):
     ) -> None:
         self.listening = listening
         self._waiting = WaitingRequests()
+        self._later: list[Request] = []  # tried in vain, the oldest first
+        self._again_s = self._pause_s = 0.0
         self._stop = stop
         self._every_s = every_s
         self._log = log
         self._away = ""
-        self._answered = 0
 
     @abstractmethod
-    def answer(self, message: Any, request: Request) -> Answer:
-        """Return a reply, and a function to call once the reply has been sent."""
+    def answer(self, message: Any, request: Request) -> Content:
+        """Return a reply."""
 
     @abstractmethod
     def empty(self, message: Any) -> Content:
@@ -138,66 +102,64 @@ class Worker(ABC):
     def tick(self) -> None:
         """Run the periodic task."""
 
+    def notify(self) -> None:
+        """Try requests again that wait for the daemon; any thread may call this."""
+        self._again_s = min(self._again_s, self._pause_s)
+        self.listening.wake()
+
     def run(self) -> None:
         """Work until the program ends."""
         next_s = 0.0
         while not self._stop.is_set():
-            now_s = time.monotonic()
-            if now_s >= next_s:
+            if time.monotonic() >= next_s:
                 self._guarded_tick()
                 next_s = time.monotonic() + self._every_s
             if not self._waiting:
-                self.listening.wait(next_s - time.monotonic())
+                until_s = min(next_s, self._again_s) if self._later else next_s
+                self.listening.wait(until_s - time.monotonic())
             for one in self.listening.take():
                 if not self._waiting.put(one):
                     self._log(f"{one.server.name}: too many requests wait: one is dropped")
+            if self._later and time.monotonic() >= self._again_s:
+                for one in reversed(self._later):
+                    self._waiting.put_back(one)
+                self._later.clear()
             if self._waiting:
                 self._serve(self._waiting.get())
 
     def _serve(self, request: Request) -> None:
         server = request.server
-        if request.was_requeued and server.gone(request):
+        if request.was_tried and server.gone(request):
             return
-        request.begun_s = request.begun_s or time.monotonic()
+        began_s = time.monotonic()
+        request.begun_s = request.begun_s or began_s
         try:
-            content, done = self.answer(request.message, request)
+            content = self.answer(request.message, request)
             self._back()
-        except StillLoading:
+        except StillLoading as why:
             self._back()
-            self._try_again(request)
+            if str(why) and not request.is_logged:
+                self._log(f"{server.name}: a request waits: {why}")
+                request.is_logged = True
+            self._try_later(request, began_s)
             return
         except LATER as error:
             self._gone(error)
-            if self._has_failed(request):
-                self._log(f"{server.name}: not answered after {request.failed} tries: {error}")
-                return
             request.begun_s = 0.0  # restart the timeout of cells when the daemon is back
-            self._try_again(request)
-            self._stop.wait(_AGAIN_S)
-            return
-        except TooLarge as error:
-            self._log(f"{server.name}: not answered: {error}")
+            self._try_later(request, time.monotonic())
             return
         except (ShmmapError, ValueError) as error:
             self._log(f"{server.name}: answered with nothing: {error}")
-            content, done = self.empty(request.message), no_followup
-        if server.present(request):
-            why = server.reply(content)
-            if why:
-                self._log(f"{server.name}: an answer of {len(content)} bytes was not sent: {why}")
-            else:
-                done()
+            content = self.empty(request.message)
+        if server.present(request) and (why_not := server.reply(ready_made(server.kind.reply, content))):
+            self._log(f"{server.name}: an answer of {len(content)} bytes was not sent: {why_not}")
 
-    def _try_again(self, request: Request) -> None:
-        request.was_requeued = True
-        self._waiting.requeue(request)
-
-    def _has_failed(self, request: Request) -> bool:
-        """Return whether the request fails by itself, not because the daemon is away."""
-        if self._answered > request.answers:
-            request.answers = self._answered
-            request.failed += 1
-        return request.failed >= _MAX_FAILED
+    def _try_later(self, request: Request, began_s: float) -> None:
+        request.was_tried, now_s = True, time.monotonic()
+        self._pause_s = max(self._pause_s, now_s) + _PAUSES * (now_s - began_s)
+        if not self._later:
+            self._again_s = self._pause_s + _AGAIN_S
+        self._later.append(request)
 
     def _guarded_tick(self) -> None:
         try:
@@ -214,7 +176,6 @@ class Worker(ABC):
             self._log(f"requests wait: {error.message}")
 
     def _back(self) -> None:
-        self._answered += 1
         if self._away:
             self._away = ""
             self._log("requests are answered again")

@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 
 from shmmap import BadRequest, MapDataError
 
-__all__ = ["BinLayout", "guess_layout"]
-
 OPTION_HINT: Final = (
     "name the columns, such as --bin-columns x,y,z,intensity,ring; doubles: x:f8,y,z,intensity"
 )

@@ -19,8 +19,6 @@ from shmmap.errors import MapMissing
 from shmmap.layers import build_layer
 from shmmap_clients.scans.bin_layout import BinLayout, guess_layout
 
-__all__ = ["MIN_RANGE_M", "SCAN_SUFFIXES", "ScanReader", "read_scan", "thinned"]
-
 SCAN_SUFFIXES: Final = (".pcd", ".npz", ".bin")
 MIN_RANGE_M: Final = 0.5
 """Default range below which points are left out: no-returns at (0, 0, 0) and parts of the vehicle."""

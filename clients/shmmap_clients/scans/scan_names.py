@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 from shmmap import BadRequest
 from shmmap_clients.scans.trajectory import Trajectory
 
-__all__ = ["in_order", "pair_with_poses", "stem"]
-
 _NUMBERS: Final = re.compile(r"([0-9]+)")
 _DECIMAL: Final = re.compile(r"(?<![0-9.A-Za-z])[0-9]*\.[0-9]+(?![0-9.])|(?<![0-9.])[0-9]+\.[0-9]+(?![0-9.])")
 _UNITS: Final = (1.0, 1e-3, 1e-6, 1e-9)  # units of times: seconds to nanoseconds

@@ -18,8 +18,6 @@ from shmmap_clients.scans.scan_file import SCAN_SUFFIXES, ScanReader
 from shmmap_clients.scans.scan_names import in_order, pair_with_poses, stem
 from shmmap_clients.scans.trajectory import Trajectory
 
-__all__ = ["Scan", "ScanSequence"]
-
 _PERIOD_S: Final = 0.1  # period of scans without a time, as of most LiDARs
 
 
@@ -113,7 +111,8 @@ class ScanSequence:
             raise MapDataError(f"{os.fspath(directory)}: cannot be read: {error.strerror}") from error
         if not found:
             raise MapMissing(
-                f"{os.fspath(directory)} has no scans", hint=f"names end in {', '.join(SCAN_SUFFIXES)}"
+                f"{os.fspath(directory)} has no scans",
+                hint=f"names end in {', '.join(SCAN_SUFFIXES)}; those in a bag in .db3, .mcap",
             )
         self.files = in_order(found)
         self.reader = reader if reader is not None else ScanReader(min_range=0.0)
@@ -129,13 +128,6 @@ class ScanSequence:
 
     def __len__(self) -> int:
         return len(self.files)
-
-    @property
-    def trajectory(self) -> Trajectory | None:
-        """Times and poses of the scans, in order; None without poses."""
-        if self._trajectory is None:
-            return None
-        return Trajectory(self._trajectory.stamps_s[self._rows], self._trajectory.T_map_sensor[self._rows])
 
     def leave_out(self, count: int) -> None:
         """Skip the first ``count`` scans."""

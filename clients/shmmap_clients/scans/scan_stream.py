@@ -22,8 +22,6 @@ from shmmap_clients.scans.scan_sequence import Scan
 from shmmap_clients.scans.trajectory import pose_of
 from shmmap_clients.streams import Publisher, Subscriber
 
-__all__ = ["ScanPublisher", "ScanSubscriber", "decode_scan", "encode_scan"]
-
 _VERSION: Final = 1
 _QUEUE: Final = 64  # scans queued for a slow reader; further scans are dropped
 _LINGER_MS: Final = 10_000

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from shmmap import BadRequest, MapDataError
 from shmmap.errors import MapMissing
 
-__all__ = ["Trajectory", "matrix_of", "pose_of", "quaternion_of", "read_route", "read_trajectory", "tum_line"]
-
 _NORM_TOLERANCE = 1e-2
 _UNITS: Final = (("seconds", 1.0), ("milliseconds", 1e-3), ("microseconds", 1e-6), ("nanoseconds", 1e-9))
 _CLOCK_S: Final = (5e8, 5e9)  # times of clocks: 1985 to 2128
@@ -46,6 +44,10 @@ class Trajectory:
     stamps_s: NDArray[np.float64]
     T_map_sensor: NDArray[np.float64]
     notes: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        times = f", {self.stamps_s[0]:.3f} to {self.stamps_s[-1]:.3f} s" if len(self) else ""
+        return f"<Trajectory of {len(self)} poses{times}>"
 
     def __len__(self) -> int:
         return len(self.stamps_s)
@@ -115,6 +117,61 @@ def quaternion_of(rotation: NDArray[np.float64]) -> tuple[float, float, float, f
         q[3] = float(r[k, j] - r[j, k]) / scale
     sign = -1.0 if q[3] < 0 else 1.0
     return sign * q[0], sign * q[1], sign * q[2], sign * q[3]
+
+
+def motion_of(T: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the translation and rotation vector of a transform, (6,)."""
+    R = T[:3, :3]
+    axis = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    sine, cosine = float(np.linalg.norm(axis)) / 2.0, (float(np.trace(R)) - 1.0) / 2.0
+    angle = math.atan2(sine, cosine)
+    # near half a turn the axis is undefined; no vehicle turns that far between two scans
+    scale = 0.5 if sine < 1e-9 else angle / (2.0 * sine)
+    return np.concatenate([T[:3, 3], axis * scale])
+
+
+def moved(motion: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the transform, (4, 4), of a translation and a rotation vector (Rodrigues)."""
+    x, y, z = motion[3:]
+    angle = math.sqrt(x * x + y * y + z * z)
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    T = np.eye(4)
+    if angle > 1e-12:
+        T[:3, :3] += math.sin(angle) / angle * K + (1 - math.cos(angle)) / angle**2 * (K @ K)
+    T[:3, 3] = motion[:3]
+    return T
+
+
+def interpolate(
+    trajectory: Trajectory, stamp_s: float, longest_s: float = math.inf
+) -> NDArray[np.float64] | None:
+    """Return the interpolated pose at a time.
+
+    Parameters
+    ----------
+    trajectory
+        Poses ordered by time.
+    stamp_s
+        Time, seconds.
+    longest_s
+        Longest time between two poses to interpolate, seconds.
+
+    Returns
+    -------
+    (4, 4); None before the first or after the last pose, or where two poses are too far apart.
+    """
+    stamps = trajectory.stamps_s
+    if not len(stamps) or stamp_s < stamps[0] or stamp_s > stamps[-1]:
+        return None
+    after = int(np.searchsorted(stamps, stamp_s))
+    if stamps[after] == stamp_s:
+        return np.asarray(trajectory.T_map_sensor[after], np.float64)
+    step_s = stamps[after] - stamps[after - 1]
+    if step_s > longest_s:
+        return None
+    a, b = trajectory.T_map_sensor[after - 1], trajectory.T_map_sensor[after]
+    share = (stamp_s - stamps[after - 1]) / step_s
+    return np.asarray(a @ moved(motion_of(np.linalg.inv(a) @ b) * share), np.float64)
 
 
 def tum_line(stamp_s: float, T_map_sensor: NDArray[np.float64]) -> str:

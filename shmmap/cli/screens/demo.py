@@ -22,18 +22,6 @@ if TYPE_CHECKING:
     from rich.progress import TaskID
 
     from shmmap.demo.demo import DemoResult
-    from shmmap.demo.live_drive import LiveDriveResult
-
-__all__ = [
-    "DemoReport",
-    "LiveProgress",
-    "PlainProgress",
-    "live_report",
-    "print_report",
-    "progress_for",
-    "town_report",
-]
-
 
 _PLAIN_EVERY_S: Final = 10.0
 
@@ -153,6 +141,8 @@ class DemoReport:
         Lines of the report by name.
     picture_svg
         The picture.
+    picture_png
+        A picture of the points; empty without one.
     passed
         Whether all checks passed.
     rows
@@ -164,6 +154,7 @@ class DemoReport:
     picture_svg: str
     passed: bool
     rows: Sequence[Sequence[str]] = ()
+    picture_png: bytes = b""
 
 
 def print_report(report: DemoReport, picture: str, duration_s: float) -> None:
@@ -211,9 +202,8 @@ def town_report(result: DemoResult) -> DemoReport:
         "outage": dataclasses.asdict(out),
         "localization": dataclasses.asdict(found) if found else None,
     }
-    return DemoReport(
-        document, _town_lines(result), _draw(result), found is None or found.trustworthy == found.scans, rows
-    )
+    passed = found is None or found.trustworthy == found.scans
+    return DemoReport(document, _town_lines(result), _draw(result), passed, rows, town.picture_png)
 
 
 def _town_lines(result: DemoResult) -> dict[str, str]:
@@ -221,9 +211,9 @@ def _town_lines(result: DemoResult) -> dict[str, str]:
     last = result.rounds[-1]
     count, shared, private = last.consumers, last.shared, last.private
     more_shared, more_private = result.one_more_bytes
-    too_small = ""
+    pays = "" if result.pays_from is None else f"; less from {result.pays_from} processes on"
     if shared.total_bytes >= private.total_bytes:  # plus each process's fixed size
-        too_small = (
+        pays = (
             f". The map around the vehicle ({format_bytes(shared.map_bytes)}) is too small to gain"
             " from sharing; --density 100 makes a larger one"
         )
@@ -232,7 +222,7 @@ def _town_lines(result: DemoResult) -> dict[str, str]:
         position = (
             f"{found.scans} LiDAR scans: {found.error_m * 100:.1f} cm off,"
             f" {found.error_max_m * 100:.1f} cm at most; first pose after"
-            f" {format_duration(found.first_pose_s)}"
+            f" {format_duration(found.first_pose_s)} (kernels were compiled before)"
         )
     return {
         "town": (
@@ -241,7 +231,7 @@ def _town_lines(result: DemoResult) -> dict[str, str]:
         ),
         "memory": (
             f"{count} processes, a private copy each: {format_bytes(private.total_bytes)}; with shmmap:"
-            f" {format_bytes(shared.total_bytes)}{too_small}"
+            f" {format_bytes(shared.total_bytes)}{pays}"
         ),
         "one more": (
             f"each further process: {format_bytes(more_private)} with a copy, {format_bytes(more_shared)}"
@@ -282,44 +272,7 @@ def _draw(result: DemoResult) -> str:
         title=f"A generated town: {town.cells} cells, {town.points / 1e6:.1f} million points",
         note=f"At the end of the drive {resident} cells are in shared memory, once for all"
         f" {shared.consumers} processes: {format_bytes(shared.shm_bytes)}.",
-        raster=Raster(town.bounds, town.picture_png),
+        raster=Raster(town.bounds, town.backdrop_png),
         driven=[(pose.x, pose.y) for pose in town.route],
         vehicle=Vehicle(end.x, end.y, end.heading, result.radius),
     )
-
-
-def live_report(result: LiveDriveResult) -> DemoReport:
-    """Report a drive that was mapped, the processes killed on it, and whether a voxel was lost."""
-    voxels = f"{result.voxels:,}".replace(",", " ")
-    compared = f"all {voxels} voxels on disk are as in a map without bounds of the same scans"
-    if result.differing:
-        differing = f"{result.differing:,}".replace(",", " ")
-        compared = (
-            f"{differing} of {voxels} voxels on disk are NOT as in a map without bounds of the same scans"
-        )
-    lines = {
-        "drive": (
-            f"{result.scans} LiDAR scans, {result.points / 1e6:.1f} million points, on {result.length_m:g} m;"
-            f" mapped in {format_duration(result.mapping_s)}, with both kills"
-        ),
-        "map": (
-            f"{result.chunks} chunks, {voxels} known voxels; each takes"
-            f" {result.active_bytes / max(1, result.active):.1f} bytes in memory,"
-            f" {result.file_bytes / max(1, result.voxels):.1f} on disk"
-        ),
-        "memory": (
-            f"chunks in service took at most {format_bytes(result.max_bytes)} of"
-            f" {format_bytes(result.budget_bytes)}; {result.evicted} times a chunk was saved and evicted,"
-            f" {result.came_back} times one came back"
-        ),
-        "kill -9": (
-            f"the daemon after scan {result.daemon_killed_at}: back in"
-            f" {format_duration(result.daemon_down_s)}, and found {result.daemon_chunks} chunks in memory;"
-            f" the mapping program after scan {result.mapper_killed_at}: its next run continued with scan"
-            f" {result.mapper_resumed_at}"
-        ),
-        "compared": compared,
-    }
-    document = dataclasses.asdict(result)
-    picture_svg = document.pop("picture_svg")
-    return DemoReport(document, lines, picture_svg, passed=not result.differing)

@@ -4,27 +4,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+import os
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from typing import TYPE_CHECKING, Final
 
-from shmmap.cli.screens.output import counted, format_bytes, format_duration, format_metres
-from shmmap.cli.screens.picture import CellSquare, Vehicle, top_view_svg
+from shmmap.cli.screens.output import Line, counted, format_bytes, format_duration, format_metres, printable
+from shmmap.cli.screens.picture import CellSquare, Raster, Vehicle, top_view_svg
 from shmmap.formats.svg import BoxTuple, escape
 
 if TYPE_CHECKING:
     from shmmap.client.live.chunk_reader import ChunkInfo
     from shmmap.protocol.rows import CellRow, ClientRow
 
-__all__ = ["GLYPHS", "LIVE_STATES", "Scene", "chunk_squares", "html_page", "svg", "terminal_rows"]
-
-
 GLYPHS: Final = {
     # state: glyph, style on a terminal
     "resident": ("#", "green"),
-    "fetched": ("+", "cyan"),
+    "ahead": ("+", "cyan"),
     "stale": ("s", "yellow"),
-    "zombie": ("r", "magenta"),
+    "retired": ("r", "magenta"),
     "disk": (".", "bright_black"),
     "saved": (".", "bright_black"),
     "clean": ("#", "green"),
@@ -36,7 +35,7 @@ GLYPHS: Final = {
     "none": (" ", ""),
 }
 
-_ORDER: Final = ("zombie", "stale", "fetched", "resident")  # the last state in this order is drawn
+_ORDER: Final = ("retired", "stale", "ahead", "resident")  # the last state in this order is drawn
 
 _OUTLINE_POINTS: Final = 180
 CHARACTER_ASPECT: Final = 2.0  # a character is about twice as high as it is wide
@@ -64,6 +63,8 @@ class Scene:
         Whether the map has nothing to draw, not even on disk.
     chunks
         Columns of chunks of a live map, drawn instead of cells.
+    points
+        The points of cells in memory, seen from above, for a file.
     """
 
     bounds: BoxTuple
@@ -75,6 +76,7 @@ class Scene:
     note: str
     empty: bool = False
     chunks: Sequence[CellSquare] = ()
+    points: Raster | None = None
 
     def by_cell(self) -> dict[str, list[CellRow]]:
         """Return the segments of each cell, the most important state last."""
@@ -84,14 +86,8 @@ class Scene:
         return found
 
 
-def state_of(row: CellRow) -> str:
-    """Return the name in `GLYPHS` of a segment's state; ``fetched``: prefetched and not requested yet."""
-    return "fetched" if row.ahead else row.state
-
-
 def _rank(row: CellRow) -> int:
-    state = state_of(row)
-    return _ORDER.index(state) if state in _ORDER else -1
+    return _ORDER.index(row.shown_state) if row.shown_state in _ORDER else -1
 
 
 # --- on a terminal ------------------------------------------------------------------------------------
@@ -127,7 +123,7 @@ def terminal_rows(scene: Scene, columns: int, lines: int) -> list[list[str]]:
     for _, box in scene.disk:
         fill(box, "disk")
     for rows in scene.by_cell().values():
-        fill(rows[-1].box, state_of(rows[-1]))
+        fill(rows[-1].box, rows[-1].shown_state)
     for square in scene.chunks:
         fill(square.box, square.state)
     for client in scene.clients:
@@ -140,6 +136,122 @@ def terminal_rows(scene: Scene, columns: int, lines: int) -> list[list[str]]:
             if 0 <= row < height and 0 <= at < width:
                 grid[row][at] = "client"
     return grid
+
+
+def terminal_map(scene: Scene, columns: int, lines: int, *, solid: bool) -> list[Line]:
+    """Return the picture with axes in metres, a scale bar and names, where there is room for them.
+
+    Parameters
+    ----------
+    columns, lines
+        Room for all of it.
+    solid
+        Draw areas with blocks instead of ASCII letters.
+    """
+    min_x, min_y, max_x, max_y = scene.bounds
+    if columns < _NARROWEST:
+        return _joined(_characters(scene, terminal_rows(scene, columns, lines), solid=solid))
+    margin = max(len(f"{bound:.0f}") for bound in (min_y, max_y)) + 3  # a label has no decimals, or few
+    grid = terminal_rows(scene, max(columns - margin, 1), max(lines - 3, 1))
+    width, height = len(grid[0]), len(grid)
+    step = _tick_step((max_x - min_x) / width * _TICK_COLUMNS)
+    drawn = _joined(_characters(scene, grid, solid=solid))
+    span_y = max(max_y - min_y, 1e-9)
+    marks = {
+        min(int((max_y - y) / span_y * height), height - 1): y
+        for y in _ticks(min_y, max_y, _tick_step(span_y / height * _TICK_LINES))
+    }
+    rows: list[Line] = []
+    for at, line in enumerate(drawn):
+        label = format_metres(marks[at]) if at in marks else ""
+        rows.append([(f"{label:>{margin - 2}} {'-' if at in marks else '|'}", _AXIS), *line])
+    axis, labels = ["-"] * width, ""
+    for x in _ticks(min_x, max_x, step):
+        at = min(int((x - min_x) / max(max_x - min_x, 1e-9) * width), width - 1)
+        axis[at] = "|"
+        label = format_metres(x)
+        start = margin + at - len(label) // 2
+        if start > len(labels) and start + len(label) <= columns:
+            labels = f"{labels:{start}}{label}"
+    bar = max(int(step / max(max_x - min_x, 1e-9) * width), 2)
+    scale = f"{'':{margin}}|{'-' * (bar - 2)}| {format_metres(step)} m"
+    return [*rows, [(" " * margin + "".join(axis), _AXIS)], [(labels, _AXIS)], [(scale[:columns], _AXIS)]]
+
+
+_NARROWEST: Final = 30  # columns below which there are no axes
+_TICK_COLUMNS: Final = 12
+_TICK_LINES: Final = 4
+_AXIS: Final = "bright_black"
+_SOLID: Final = {
+    "resident": "█", "ahead": "▓", "stale": "▓", "retired": "▒", "disk": "·", "window": "○", "client": "●",
+    "saved": "·", "clean": "█", "loading": "█", "saving": "█", "dirty": "█", "none": " ",
+}  # fmt: skip
+
+
+def glyph(state: str, *, solid: bool) -> str:
+    """Return the character of a state."""
+    return _SOLID[state] if solid else GLYPHS[state][0]
+
+
+def _characters(scene: Scene, grid: list[list[str]], *, solid: bool) -> list[list[tuple[str, str]]]:
+    """Return characters and their styles, with the names of cells and clients written over them."""
+    rows = [[(glyph(state, solid=solid), GLYPHS[state][1]) for state in row] for row in grid]
+    min_x, min_y, max_x, max_y = scene.bounds
+    width, height = len(grid[0]), len(grid)
+
+    def place(x: float, y: float) -> tuple[int, int]:
+        return (
+            math.floor((x - min_x) / max(max_x - min_x, 1e-9) * width),
+            math.floor((max_y - y) / max(max_y - min_y, 1e-9) * height),
+        )
+
+    taken: set[tuple[int, int]] = set()
+
+    def write(text: str, at: int, line: int, end: int, style: str) -> None:
+        """Write a name where it covers no other, and ends before ``end``."""
+        places = [(column, line) for column in range(at, at + len(text))]
+        if 0 <= line < height and at >= 0 and at + len(text) <= min(end, width) and not taken & {*places}:
+            taken.update(places)
+            rows[line][at : at + len(text)] = [(one, style) for one in text]
+
+    clients = [client for client in scene.clients if client.pose is not None]
+    taken.update(place(*client.pose) for client in clients if client.pose is not None)
+    for client in clients:
+        if client.pose is not None:
+            at, line = place(*client.pose)
+            name = printable(client.client or client.command)
+            room = width - at - 2
+            name = name if len(name) <= room else f"{name[: room - 1]}…"
+            if room >= _SHORTEST_NAME or len(name) <= room:
+                write(name, at + 2, line, width, "bold")
+    boxes = {**dict(scene.disk), **{name: rows_[-1].box for name, rows_ in scene.by_cell().items()}}
+    for name, short in _short_names(list(boxes)).items():
+        at, line = place(boxes[name][0], boxes[name][3])
+        end = place(boxes[name][2], boxes[name][3])[0]
+        write(printable(short), at + 1, max(line, 0), end, "")
+    return rows
+
+
+_SHORTEST_NAME: Final = 6
+
+
+def _joined(rows: list[list[tuple[str, str]]]) -> list[Line]:
+    """Return lines in which neighbours of one style are one piece."""
+    by_style: Callable[[tuple[str, str]], str] = lambda one: one[1]  # noqa: E731
+    return [
+        [("".join(text for text, _ in pieces), style) for style, pieces in groupby(row, by_style)]
+        for row in rows
+    ]
+
+
+def _tick_step(at_least: float) -> float:
+    """Return the smallest 1, 2 or 5 times a power of ten that is not smaller."""
+    power = 10.0 ** math.floor(math.log10(max(at_least, 1e-6)))
+    return next(power * factor for factor in (1, 2, 5, 10) if power * factor >= at_least * (1 - 1e-9))
+
+
+def _ticks(low: float, high: float, step: float) -> list[float]:
+    return [index * step for index in range(math.ceil(low / step), math.floor(high / step) + 1)]
 
 
 def _outline(client: ClientRow) -> list[tuple[float, float]]:
@@ -160,10 +272,13 @@ def _outline(client: ClientRow) -> list[tuple[float, float]]:
 def svg(scene: Scene) -> str:
     """Return the picture as SVG, with a tooltip on every cell and client."""
     known = scene.by_cell()
-    cells = [CellSquare(box, "", f"{name}\non disk") for name, box in scene.disk if name not in known]
+    shown = _short_names([*(name for name, _ in scene.disk), *known])
+    cells = [
+        CellSquare(box, "", f"{name}\non disk", shown[name]) for name, box in scene.disk if name not in known
+    ]
     cells += [
-        CellSquare(rows[-1].box, state_of(rows[-1]), _cell_title(rows, scene.now_ns))
-        for rows in known.values()
+        CellSquare(rows[-1].box, rows[-1].shown_state, _cell_title(rows, scene.now_ns), shown[name])
+        for name, rows in known.items()
     ]
     cells += scene.chunks
     vehicles, windows = [], []
@@ -179,15 +294,29 @@ def svg(scene: Scene) -> str:
             label = client.client or client.command
             vehicles.append(Vehicle(*client.pose, client.heading, radius, title, label))
     return top_view_svg(
-        scene.bounds, cells, title=scene.title, note=scene.note, others=vehicles, windows=windows
+        scene.bounds,
+        cells,
+        title=scene.title,
+        note=scene.note,
+        raster=scene.points,
+        others=vehicles,
+        windows=windows,
     )
+
+
+def _short_names(names: Sequence[str]) -> dict[str, str]:
+    """Return names of cells without suffix, and without the word that all of them begin with."""
+    stems = {name: name.rpartition("/")[2].rpartition(".")[0] or name for name in names}
+    first = os.path.commonprefix(list(stems.values()))  # noqa: RUF071  of characters
+    word = len(first.rpartition("_")[0]) + 1 if "_" in first and len(names) > 1 else 0
+    return {name: stem[word:] for name, stem in stems.items()}
 
 
 def _cell_title(rows: Sequence[CellRow], now_ns: int) -> str:
     lines = [rows[-1].id]
     for row in rows:
         idle_s = max(now_ns - row.last_use_monotonic_ns, 0) * 1e-9
-        state = {"zombie": "retired", "fetched": "fetched ahead"}.get(state_of(row), row.state)
+        state = "fetched ahead" if row.shown_state == "ahead" else row.shown_state
         lines.append(
             f"{row.layer}: {state}, {format_bytes(row.bytes)}, {row.points:,} points, {row.hits:,} hits,"
             f" used {format_duration(idle_s)} ago, loaded in {format_duration(row.load_ns * 1e-9)}"
@@ -262,7 +391,7 @@ def _chunk_square(column: list[ChunkInfo], resolution: float) -> CellSquare:
     min_x, min_y, _, max_x, max_y, _ = column[0].key.box(resolution)
     lines = []
     for chunk in sorted(column, key=lambda chunk: chunk.key.z):
-        known = f", {counted(chunk.active, 'known voxel')}" if chunk.state != "saved" else ""
+        known = f", {counted(chunk.active, 'voxel')} known" if chunk.state != "saved" else ""
         low, high = (format_metres(chunk.key.box(resolution)[axis]) for axis in (2, 5))
         what = LIVE_STATES.get(chunk.state, chunk.state)
         lines.append(f"{chunk.key.text}, z {low} to {high} m: {what}, {format_bytes(chunk.bytes)}{known}")

@@ -10,20 +10,22 @@ from typing import Final
 
 from shmmap.formats.svg import Axes, BoxTuple, Page, dash, element, swatch, tooltip
 
-__all__ = ["CellSquare", "Raster", "Vehicle", "top_view_svg"]
-
 WIDTH_PX: Final = 960.0
 HEIGHT_PX: Final = 1400.0  # pixels of the map, at most
 MARGIN_PX: Final = 16.0
+COORDINATES_PX: Final = 52.0  # to the left of the map
+NAME_LETTER_PX: Final = 5.6  # average width of a letter of a cell's name
 LABEL_PX: Final = 16.0  # labels closer than a line would overlap
 
 _STYLE: Final = """
   .label { font-size: 13px; stroke: #fff; stroke-width: 3; paint-order: stroke; }
+  .coordinate { font-size: 12px; fill: #66727f; }
+  .name { font-size: 9px; fill: #3e4c59; pointer-events: none; }
   .cell { fill: none; stroke: #52606d; stroke-opacity: .28; stroke-width: .6; }
   .resident { fill: #0b7285; fill-opacity: .20; stroke: #0b7285; stroke-opacity: .75; stroke-width: .9; }
-  .fetched { fill: #5f3dc4; fill-opacity: .18; stroke: #5f3dc4; stroke-opacity: .75; stroke-width: .9; }
+  .ahead { fill: #5f3dc4; fill-opacity: .18; stroke: #5f3dc4; stroke-opacity: .75; stroke-width: .9; }
   .stale { fill: #e8590c; fill-opacity: .30; stroke: #e8590c; stroke-width: .9; }
-  .zombie { fill: #868e96; fill-opacity: .40; stroke: #495057; stroke-width: .9; stroke-dasharray: 3 2; }
+  .retired { fill: #868e96; fill-opacity: .40; stroke: #495057; stroke-width: .9; stroke-dasharray: 3 2; }
   .saved { stroke: #9aa5b1; stroke-opacity: .8; }
   .clean { fill: #2f9e44; fill-opacity: .22; stroke: #2f9e44; stroke-opacity: .8; }
   .dirty { fill: #2563eb; fill-opacity: .22; stroke: #2563eb; stroke-opacity: .8; }
@@ -36,9 +38,9 @@ _STYLE: Final = """
 _STATES: Final = {
     "": "cell on disk",
     "resident": "cell in shared memory",
-    "fetched": "fetched ahead",
+    "ahead": "fetched ahead",
     "stale": "stale cell",
-    "zombie": "zombie",
+    "retired": "retired cell",
     "saved": "chunk on disk",
     "clean": "in memory, saved",
     "dirty": "not saved yet",
@@ -50,11 +52,12 @@ _STATES: Final = {
 
 @dataclass(frozen=True, slots=True)
 class CellSquare:
-    """One cell: its box (metres), its state (one of `_STATES`) and a tooltip."""
+    """One cell: its box (metres), its state (one of `_STATES`), a tooltip, and the name written in it."""
 
     box: BoxTuple
     state: str = ""
     title: str = ""
+    name: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,18 +116,20 @@ def top_view_svg(
         Rectangles that clients follow, metres, and their tooltips.
     """
     page = Page(WIDTH_PX, title, margin=MARGIN_PX, style=_STYLE)
-    axes = Axes.fitted(page, bounds, MARGIN_PX, HEIGHT_PX)
+    axes = Axes.fitted(page, bounds, MARGIN_PX, HEIGHT_PX, left=COORDINATES_PX)
     with axes.clipped():
         if raster is not None:
             axes.image(raster.box, raster.png)
         for cell in sorted(cells, key=lambda cell: bool(cell.state)):
             axes.rectangle(cell.box, tooltip(cell.title), class_=f"cell {cell.state}")
+        _write_names(axes, cells)
         axes.line(driven, class_="route")
         for box, words in windows:
             axes.rectangle(box, tooltip(words), class_="window")
         for one in _labelled_apart(axes, [*others, *([vehicle] if vehicle is not None else [])]):
             _draw_vehicle(axes, one)
-    page.heading(axes.bottom + 30, title, note)
+    axes.coordinates(class_="coordinate")
+    page.heading(axes.bottom + 52, title, note)
     states = {cell.state for cell in cells}
     entries = [(swatch(class_=f"cell {state}"), text) for state, text in _STATES.items() if state in states]
     if driven:
@@ -133,7 +138,16 @@ def top_view_svg(
         entries.append((element("circle", class_="vehicle", cx=9, cy=-5, r=6), "client"))
     if driven or others or windows:
         entries.append((dash(class_="window"), "window"))
-    return page.svg(axes.legend(axes.bottom + 78, entries) + 16)
+    return page.svg(axes.legend(axes.bottom + 100, entries) + 16)
+
+
+def _write_names(axes: Axes, cells: Sequence[CellSquare]) -> None:
+    """Write the names of cells into their corners, if there is room for all."""
+    if all(len(cell.name) * NAME_LETTER_PX + 4 <= (cell.box[2] - cell.box[0]) * axes.scale for cell in cells):
+        for cell in cells:
+            if cell.name:
+                x, y = axes.place(cell.box[0], cell.box[3])
+                axes.page.text(x + 3, y + 10, cell.name, class_="name")
 
 
 def _labelled_apart(axes: Axes, vehicles: Sequence[Vehicle]) -> list[Vehicle]:

@@ -9,27 +9,28 @@ from typing import TYPE_CHECKING, Final
 
 from shmmap.doctor.verdicts import signature_lines, trust_problems
 from shmmap.quantities import counted, format_bytes, format_duration, format_utc
+from shmmap.statistics.counters import LINK_CAUSES
 
 if TYPE_CHECKING:
     from shmmap.protocol.rows import LiveMapRow
     from shmmap.statistics.identity import DaemonIdentity
 
-__all__ = [
-    "STATE_STYLES",
-    "live_problems",
-    "over_fetch",
-    "prefetch_words",
-    "published_lines",
-    "published_words",
-    "since",
-    "status_lines",
-    "uptime_s",
-]
+_NOT_PREPARED: Final = (
+    "",
+    "; no more: --cache-size is too small for them",
+    "; waiting: the cache directory is full or cannot be written",
+)
+"""What keeps layers from being prepared, by the value of ``prepare_short``."""
 
 
 def uptime_s(identity: DaemonIdentity) -> float:
     """Return for how long the daemon has run, seconds."""
     return max(time.time() - identity.started_unix_ns * 1e-9, 0.0)
+
+
+def taken_bytes(counters: Mapping[str, int]) -> int:
+    """Return how much of the budget is taken: segments, retired ones, loads under way, the statistics."""
+    return sum(counters.get(f"bytes_{name}", 0) for name in ("resident", "zombie", "reserved", "statistics"))
 
 
 def over_fetch(counters: Mapping[str, int]) -> float | None:
@@ -58,11 +59,26 @@ def prefetch_words(counters: Mapping[str, int]) -> list[tuple[str, bool]]:
     return words
 
 
+def prepare_words(counters: Mapping[str, int], layers: str) -> str:
+    """Return how far the layers of the setting ``prepare`` are; empty if it names none."""
+    cells, done = counters.get("prepare_cells", 0), counters.get("prepare_done", 0)
+    if not layers:
+        return ""
+    words = f"{layers}: {done:,} of {counted(cells, 'cell')}"
+    if failed := counters.get("prepare_failed", 0):
+        words += f", {failed:,} cannot be made: the log names them"
+    if again := counters.get("prepare_retries", 0):
+        words += f" ({again:,} will be tried again: the loader was killed)"
+    return words + _NOT_PREPARED[min(counters.get("prepare_short", 0), len(_NOT_PREPARED) - 1)]
+
+
 def published_lines(counters: Mapping[str, int]) -> list[tuple[str, str]]:
     """Return label and text of each line about a published map; none if the map is files."""
     if not counters.get("published_version"):
         return []
     lines = [("version", _version(counters)), ("known", _known(counters)), ("fetched", _fetched(counters))]
+    if link := _link(counters):
+        lines.append(("link", link))
     lines[1:1] = [("signature", text) for text in signature_lines(counters, time.time())]
     if troubles := _troubles(counters):
         lines.append(("", troubles))
@@ -111,6 +127,16 @@ def _fetched(counters: Mapping[str, int]) -> str:
     return f"{fetched}; from the disk {disk}"
 
 
+def _link(counters: Mapping[str, int]) -> str:
+    """Return what came over the link and for what, and its rate; empty before anything came."""
+    by_cause = {cause: counters.get(f"link_{cause}_bytes", 0) for cause in LINK_CAUSES}
+    if not any(by_cause.values()):
+        return ""
+    words = ", ".join(f"{format_bytes(nbytes)} {cause}" for cause, nbytes in by_cause.items())
+    rate = counters.get("link_rate_bytes", 0)
+    return words + (f"; {8e-6 * rate:.3g} Mbit/s" if rate else "")
+
+
 def _troubles(counters: Mapping[str, int]) -> str:
     found = (
         ("fetches_failed", "fetches failed"),
@@ -133,19 +159,18 @@ def live_problems(row: LiveMapRow) -> list[str]:
     """Return the problems of a live map, one line each."""
     found = [row.problem] if row.problem else []
     if row.damaged_count:
-        found.append(f"damaged files, missing chunks: {row.damaged_count:,}; `shmmap live ls` names them")
+        found.append(f"lost chunks, damaged databases: {row.damaged_count:,}; `shmmap live ls` names them")
     return found
 
 
 def status_lines(rows: Sequence[LiveMapRow], restarts: int) -> list[tuple[str, str]]:
-    """Return the lines of ``status`` about live maps and their problems; none without live maps."""
+    """Return the lines of ``status`` about live maps; none without live maps."""
     lines = []
     for row in rows:
         unsaved = f"{row.unsaved:,} not saved" if row.unsaved else "all saved"
         memory = f"{format_bytes(row.bytes)} of {format_bytes(row.budget_bytes)}"
-        known = counted(row.active, "known voxel")
+        known = f"{counted(row.active, 'voxel')} known"
         lines.append((f"live {row.name}", f"{counted(row.chunks, 'chunk')}, {memory}, {known}, {unsaved}"))
-        lines += [("", problem) for problem in live_problems(row)]
     if restarts:
         often = counted(restarts, "time")
         lines.append(("", f"the process that keeps live maps ended {often}: see the daemon's log"))

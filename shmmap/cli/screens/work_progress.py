@@ -14,9 +14,6 @@ if TYPE_CHECKING:
     from shmmap.dividing.merge import MergedCloud
     from shmmap.origin.map_report import DividedMap
 
-__all__ = ["StageProgress", "fields_text", "print_result"]
-
-
 _REDRAW_S: Final = 0.2
 
 _LINE_S: Final = 10.0  # seconds between lines where output is not a terminal

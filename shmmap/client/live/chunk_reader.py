@@ -20,8 +20,6 @@ from shmmap.chunks.reading import read_chunk, sequence_of
 from shmmap.chunks.voxels import ChunkKey, in_chunk, voxel_indices
 from shmmap.errors import SegmentCorrupt, SegmentError, StaleHandle
 
-__all__ = ["ChunkInfo", "ChunkReader", "Place"]
-
 MAX_COPIES: Final = 512
 """Number of chunk copies that are kept; the least recently used are dropped first."""
 VOXELS_PER_STEP: Final = 1 << 20

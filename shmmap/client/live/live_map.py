@@ -258,8 +258,7 @@ class LiveMap:
     def lost(self, area: geometry.Box | Sphere | None = None) -> dict[ChunkKey, str]:
         """Return the chunks of which something that was saved is lost, each with what; at most 64.
 
-        Their file is damaged, and in quarantine, or is gone.  Each stays in this list, also when it is mapped
-        again, until the file is back, or ``shmmap live fsck --repair`` forgets it.
+        Each stays in this list, also when it is mapped again, until ``shmmap live fsck --repair`` forgets it.
 
         Parameters
         ----------

@@ -42,8 +42,6 @@ from shmmap.protocol import live as messages
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-__all__ = ["LiveMapper"]
-
 PASSING: Final = (LiveInterrupted, Busy, DaemonUnreachable)
 """Temporary errors: sending is retried."""
 MAX_UNANSWERED: Final = 3

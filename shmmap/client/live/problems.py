@@ -9,8 +9,6 @@ from typing import Final
 from shmmap.errors import NoAnswer, ShmmapError
 from shmmap.protocol.live import LiveListed
 
-__all__ = ["PROBLEM_S", "with_problem"]
-
 PROBLEM_S: Final = 1.0
 """Time for the daemon to say why it has not answered."""
 

@@ -27,8 +27,6 @@ from shmmap.protocol.messages import Intent
 from shmmap.segment.attach import Owned
 from shmmap.segment.process_limits import no_files_left
 
-__all__ = ["BlockingFollower", "WindowFollower"]
-
 _PENDING_WAIT_S: Final = 0.25
 """How long one request waits for loads; then the loaded cells are published, and a new pose is accepted."""
 
@@ -41,7 +39,7 @@ _FIRST_PAUSE_S: Final = 0.005  # between a call's requests for cells that do not
 _STALLED_S: Final = 0.5  # a call gives up on cells that do not fit after this long without progress
 
 
-class _Follower:
+class Follower:
     """State, latest pose and last error of a window, for both kinds of followers.
 
     Attributes
@@ -76,7 +74,63 @@ class _Follower:
         self.error = error
 
 
-class WindowFollower(_Follower):
+class PacedFollower(Follower):
+    """A follower that decides by itself when to ask."""
+
+    def __init__(self, refresher: WindowRefresher, update_distance: float, refresh_interval_s: float) -> None:
+        super().__init__(refresher, update_distance, refresh_interval_s)
+        self._pause_s = 0.0
+        self._due_s = math.inf  # no request before the first pose
+
+    def is_current(self, state: WindowState) -> bool:
+        """Return whether a state answers the latest pose, and nothing is missing."""
+        return self.answers(state) and self.error is None and state.settled and not self._refresher.lost
+
+    def _due_pose(self) -> Intent | None:
+        """Return the pose to ask for now, if a request is due."""
+        pose = self._pose
+        if pose is None:
+            return None
+        if self.error is None and (not self.answers(self.state) or self._refresher.lost):
+            self._due_s = 0.0
+        return pose if time.monotonic() >= self._due_s else None
+
+    def _wait_s(self) -> float | None:
+        """Return how long the next request lets the daemon wait."""
+        return _PENDING_WAIT_S if self.state.pending and self.error is None else None
+
+    def _answered(self, state: WindowState, progress: bool, wait_s: float | None) -> None:
+        """Publish an answer, and set the time of the next request."""
+        self._publish(state, None)
+        pause_s = 0.0
+        if state.settled:
+            self._pause_s, pause_s = 0.0, self._refresh_interval_s
+        elif progress or (state.pending and wait_s is None):
+            self._pause_s = 0.0
+        elif not state.pending:
+            pause_s = self._pause()
+        self._due_s = time.monotonic() + pause_s
+
+    def _failed(self, error: Exception) -> None:
+        """Publish an error of a request, and set the time of the next one; raise what is none of ours."""
+        if not isinstance(error, ShmmapError):
+            limit = no_files_left(error)  # to load a module, for example
+            if limit is None:
+                raise error
+            error = limit
+        self._publish(self.state, error)
+        self._due_s = time.monotonic() + self._pause()
+
+    def _pause(self) -> float:
+        self._pause_s = min(max(self._pause_s * 2, _RETRY_S), _RETRY_MAX_S)
+        return self._pause_s
+
+    def _publish(self, state: WindowState, error: ShmmapError | None) -> None:
+        self.state = state  # before the error: a reader without an error sees the matching state
+        self._note(error)
+
+
+class WindowFollower(PacedFollower):
     """Keeps a window current in a thread of its own.
 
     All inputs reach the thread through one queue: new poses, memory to unmap, loss of the connection, the
@@ -104,8 +158,6 @@ class WindowFollower(_Follower):
         self._mailbox: SimpleQueue[Owned | None] = SimpleQueue()
         self._called = False
         self._stopping = False
-        self._pause_s = 0.0
-        self._due_s = math.inf  # no request before the first pose
         self._waiters: list[weakref.ref[SimpleQueue[None]]] = []
         self._over: SimpleQueue[None] = SimpleQueue()
         self._ended = False
@@ -148,7 +200,7 @@ class WindowFollower(_Follower):
 
         The returned state is that one, even if a later state has replaced it meanwhile.
         """
-        return self.wait_for(self._is_current, timeout_s)
+        return self.wait_for(self.is_current, timeout_s)
 
     def wait_for(self, fits: Callable[[WindowState], bool], timeout_s: float) -> WindowState | None:
         """Wait for a state for which ``fits`` is true and return it; None at the deadline."""
@@ -162,9 +214,6 @@ class WindowFollower(_Follower):
             except Empty:
                 return None
         return state
-
-    def _is_current(self, state: WindowState) -> bool:
-        return self.answers(state) and self.error is None and state.settled and not self._refresher.lost
 
     def stop(self) -> None:
         """End the thread; attached cells stay attached."""
@@ -187,13 +236,8 @@ class WindowFollower(_Follower):
         try:
             enter(self)
             while self._wait(self._due_s):
-                pose = self._pose
-                if pose is None:
-                    continue
-                if self.error is None and (not self.answers(self.state) or self._refresher.lost):
-                    self._due_s = 0.0
-                if time.monotonic() >= self._due_s:
-                    self._due_s = time.monotonic() + self._refresh(pose)
+                if (pose := self._due_pose()) is not None:
+                    self._refresh(pose)
         except BaseException as error:
             self._publish(self.state, InternalError(f"the window's thread ended: {error!r}"))
             raise
@@ -223,38 +267,18 @@ class WindowFollower(_Follower):
             if remaining_s > 0 or self._stopping:
                 return not self._stopping
 
-    def _refresh(self, pose: Intent) -> float:
-        """Send one request and publish the resulting state; return the seconds until the next request."""
-        before = self.state
-        wait_s = _PENDING_WAIT_S if before.pending and self.error is None else None
+    def _refresh(self, pose: Intent) -> None:
+        """Send one request and publish the resulting state."""
+        wait_s = self._wait_s()
         try:
-            state, progress = self._refresher.refresh(before, pose, wait_s)
-        except ShmmapError as error:
-            self._publish(before, error)
-            return self._pause()
-        except (OSError, ImportError) as error:
-            limit = no_files_left(error)  # to load a module, for example
-            if limit is None:
-                raise
-            self._publish(before, limit)
-            return self._pause()
-        del before  # this may be the last reference to the replaced cells
-        self._publish(state, None)
-        if state.settled:
-            self._pause_s = 0.0
-            return self._refresh_interval_s
-        if progress or (state.pending and wait_s is None):
-            self._pause_s = 0.0
-            return 0.0
-        return 0.0 if state.pending else self._pause()
-
-    def _pause(self) -> float:
-        self._pause_s = min(max(self._pause_s * 2, _RETRY_S), _RETRY_MAX_S)
-        return self._pause_s
+            state, progress = self._refresher.refresh(self.state, pose, wait_s)
+        except (ShmmapError, OSError, ImportError) as error:
+            self._failed(error)
+        else:
+            self._answered(state, progress, wait_s)
 
     def _publish(self, state: WindowState, error: ShmmapError | None) -> None:
-        self.state = state  # before the error: a reader without an error sees the matching state
-        self._note(error)
+        super()._publish(state, error)
         for waiter in tuple(self._waiters):
             queue = waiter()
             if queue is None:
@@ -263,7 +287,7 @@ class WindowFollower(_Follower):
                 queue.put(None)
 
 
-class BlockingFollower(_Follower):
+class BlockingFollower(Follower):
     """Keep a window current in the calling thread; same interface as `WindowFollower`."""
 
     _asked_s = 0.0  # of the last request

@@ -13,14 +13,13 @@ import numpy as np
 import shmmap.geometry as geometry
 from shmmap.client.cell import Cell
 from shmmap.client.cell_set import CellSet, HeldCells
-from shmmap.client.client import Client
+from shmmap.client.client import SessionState
+from shmmap.client.session import Steps
 from shmmap.client.window.retention import RetentionCandidate, RetentionPolicy
 from shmmap.client.window.state import LayerKey, WindowState
 from shmmap.errors import BadRequest, OverBudget
 from shmmap.geometry import distance_to_boxes
 from shmmap.protocol.messages import Intent
-
-__all__ = ["WindowRefresher"]
 
 _Shape: TypeAlias = type[geometry.Circle] | type[geometry.AutowareSquare]
 
@@ -62,7 +61,7 @@ class WindowRefresher:
 
     def __init__(
         self,
-        client: Client,
+        client: SessionState,
         radius: float,
         *,
         layers: Sequence[str],
@@ -91,6 +90,12 @@ class WindowRefresher:
         return self._client.disconnected_since is not None
 
     def refresh(self, state: WindowState, pose: Intent, wait_s: float | None) -> tuple[WindowState, bool]:
+        """Send one request to the daemon, as `steps`."""
+        return self._client.session.run(self.steps(state, pose, wait_s))
+
+    def steps(
+        self, state: WindowState, pose: Intent, wait_s: float | None
+    ) -> Steps[tuple[WindowState, bool]]:
         """Send one request to the daemon.
 
         Returns
@@ -106,13 +111,13 @@ class WindowRefresher:
             As `Client.differential`; the old state stays valid.
         """
         area = self._make_area(pose.x, pose.y, self._radius, self._z)
-        answer = self._ask(state, area, pose, wait_s, by_name=False)
+        answer = yield from self._ask(state, area, pose, wait_s, by_name=False)
         if answer.epoch != state.epoch and state.cells:
             # A new run of the daemon cannot know which cells the versions of a previous run belonged to, and
             # does not recognise versions that are not current.  Attached cells stay attached during the new
             # request.
             first = answer
-            answer = self._ask(state, area, pose, wait_s, by_name=True)
+            answer = yield from self._ask(state, area, pose, wait_s, by_name=True)
             del first
         now_s = time.monotonic()
         if answer.map_version != state.map_version or any(isinstance(f, OverBudget) for f in answer.failed):
@@ -137,9 +142,9 @@ class WindowRefresher:
 
     def _ask(
         self, state: WindowState, area: geometry.Area, pose: Intent, wait_s: float | None, *, by_name: bool
-    ) -> CellSet:
+    ) -> Steps[CellSet]:
         held = HeldCells(state.cells.values(), by_name=by_name)
-        return self._client.session.ask_differential(
+        return self._client.session.differential(
             area, held, self._layers, wait_s, pose, populate=self._populate, timeout_s=self._timeout_s
         )
 

@@ -15,8 +15,6 @@ import msgspec
 
 from shmmap.errors import BadRequest
 
-__all__ = ["Retention", "RetentionCandidate", "RetentionPolicy"]
-
 
 class RetentionCandidate(NamedTuple):
     """A cell outside the window that is still attached.

@@ -19,8 +19,6 @@ from shmmap.protocol.messages import Intent
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["EMPTY", "LayerKey", "WindowState", "WindowUpdate", "moved", "update_between"]
-
 PASSING: Final = (OverBudget, Offline)
 """Temporary failures, after which the request is repeated."""
 
@@ -57,6 +55,11 @@ class WindowUpdate(msgspec.Struct, frozen=True, eq=False, weakref=True):
     failed: tuple[CellError, ...] = ()
     current: bool = False
     covered: bool = True
+
+    def __repr__(self) -> str:
+        counts = ((name, len(getattr(self, name))) for name in self.__struct_fields__[:6])
+        state = "" if self.current else ", of an earlier pose"
+        return f"<WindowUpdate: {', '.join(f'{count} {name}' for name, count in counts)}{state}>"
 
     @property
     def any(self) -> bool:

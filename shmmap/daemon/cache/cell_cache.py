@@ -38,12 +38,10 @@ from shmmap.segment.header import PublishBlock
 from shmmap.segment.names import new_segment_name, segment_prefix
 from shmmap.statistics.writer import StatisticsWriter
 
-__all__ = ["CellCache"]
-
 _PAGE_BYTES: Final = 4096
 _HEADER_ALLOWANCE_BYTES: Final = 2 * _PAGE_BYTES
-SHOWN_PER_TURN: Final = 16
-"""Handed-out segments whose rows are updated in one turn: 0.1 ms."""
+CHECKED_PER_TURN: Final = 16
+"""Handed-out segments that are checked in one turn: 0.1 ms."""
 
 
 class CellCache:
@@ -114,12 +112,11 @@ class CellCache:
             statistics,
             PressureEvents(event_log, self._memory, sessions.largest_holder),
             id_prefix=self.id_prefix,
-            segment_prefix=self.segment_prefix,
         )
         self.warm = WarmIndex()
         self.heights = Heights(len(catalogue))
         self.unentered = 0
-        self._used: set[Resident] = set()  # handed out since the statistics last showed them
+        self._used: set[Resident] = set()  # handed out since they were last checked
 
     # --- the map --------------------------------------------------------------------------------
 
@@ -256,12 +253,10 @@ class CellCache:
         An unchecked segment is only listed: a client that holds its version does not have to get it again.
         """
         self.warm.note_version(resident)
-        current = True
         if resident.checked:
             segment = resident.name.removeprefix(self.segment_prefix)
             self.warm.encode(resident, self.wire_id(resident.key.cell_id), segment)
-            current = self.enter_if_current(resident, index)
-        self.events.emit(self.events.show, resident, "resident" if current else "stale")
+            self.enter_if_current(resident, index)
 
     def enter_if_current(self, resident: Resident, index: int) -> bool:
         """Index a segment if it has its cell's current version; return whether it has."""
@@ -308,21 +303,18 @@ class CellCache:
                     self.ledger.asked_for(resident)
                     self.statistics.add("prefetch_used")
             resident.hits += 1
+            resident.spare = False
         self.statistics.add("bytes_used", first_used)
         self._used.update(residents)
 
-    def show_used(self, now_s: float) -> bool:
-        """Update the rows of some segments that were handed out; return whether more are left.
+    def check_used(self, now_s: float) -> bool:
+        """Check some of the segments that were handed out; return whether more are left.
 
         A segment that another program truncated is retired: clients cannot read it, and its cell is loaded
         again.
         """
-        for _ in range(min(SHOWN_PER_TURN, len(self._used))):
-            resident = self._used.pop()
-            if self.lost.retire_if_lost(resident, now_s):
-                continue
-            if self.ledger.resident_named(resident.name) is resident:
-                self.events.show(resident, "resident" if self.is_current(resident) else "stale")
+        for _ in range(min(CHECKED_PER_TURN, len(self._used))):
+            self.lost.retire_if_lost(self._used.pop(), now_s)
         return bool(self._used)
 
     def report(self, now_s: float) -> None:
@@ -374,7 +366,7 @@ class CellCache:
                 self.warm.leave(cell, layer)
 
     def segment_retired(self, resident: Resident, why: str) -> None:
-        """Remove a segment from the indices; the statistics still show its bytes."""
+        """Remove a segment from the indices; its bytes still count."""
         self.events.emit(self.events.retired, resident, why)
         self._used.discard(resident)
         self.statistics.add("prefetch_in_vain", resident.prefetched)
@@ -382,11 +374,6 @@ class CellCache:
         index = self.index_of(resident.key.cell_id)
         if index is not None and self.warm.get(index, resident.key.layer) is resident:
             self.warm.leave(index, resident.key.layer)
-        self.events.emit(self.events.show, resident, "zombie")
-
-    def segment_gone(self, name: str) -> None:
-        """Remove a segment from the statistics."""
-        self.events.emit(self.events.hide, name)
 
     def reclaim(self, now_s: float) -> bool:
         """Free some retired segments that are due, check for lost ones; return whether more may fit now."""

@@ -20,8 +20,6 @@ from typing import Final, NamedTuple
 from shmmap.daemon.records import Resident
 from shmmap.large_tables import ShardedDict
 
-__all__ = ["BATCH", "FRONT", "Deferred", "EvictionOrder", "Score"]
-
 FRONT: Final = 8
 """Segments offered at a time; when fewer are in order, this many are scored."""
 TRIES: Final = 4

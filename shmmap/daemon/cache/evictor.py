@@ -26,8 +26,6 @@ from shmmap.daemon.cache.reclaimer import (
 from shmmap.daemon.records import Resident
 from shmmap.daemon.travel.places import NOWHERE, Places, until_needed
 
-__all__ = ["Evictor", "eviction_scores"]
-
 PIN_MEMO_S: Final = 0.2
 """How long, at least, a segment found pinned is not considered again.  The time grows with each try if the
 kernel reports when a process closes the segment."""
@@ -43,6 +41,10 @@ WORK_PER_TURN: Final = 4
 """Segments handled by one `free`: checking one takes 15 us, and retiring one is as much work again."""
 PLACES_S: Final = 0.25
 """How often the positions of moving clients are updated."""
+MAX_SCORE: Final = 1e12
+"""Score of what will never be needed; finite, so that scores can be compared."""
+SPARE_SCORE: Final = 1e15
+"""Added to the score of what was loaded into spare memory."""
 SOON_S: Final = 30.0
 """Added to the time until a segment is needed; without it, size would not matter for those needed soon."""
 
@@ -52,19 +54,21 @@ def eviction_scores(candidates: Sequence[Resident], places: Places, now_s: float
 
     The score is the time until a segment is needed (s), weighted by the square root of its size: of the
     exponents tried, this one saved most bytes of loading where sizes differ.  Without any place the least
-    recently used segment is evicted first.  Requested, prefetched and computed segments are scored alike.
+    recently used segment is evicted first.  Requested, prefetched and computed segments are scored alike;
+    what was loaded into spare memory goes before all others.
 
     Parameters
     ----------
     places
         Present and future positions of the clients.
     """
+    spare = SPARE_SCORE * np.array([resident.spare for resident in candidates], dtype=np.float64)
     if not len(places):
-        return np.array([-resident.last_use_s for resident in candidates], dtype=np.float64)
+        return spare - np.array([resident.last_use_s for resident in candidates], dtype=np.float64)
     boxes = np.array([resident.box for resident in candidates]).reshape(-1, 4)
     sizes = np.array([resident.nbytes for resident in candidates], dtype=np.float64)
     scores: NDArray[np.float64] = (until_needed(boxes, places, now_s) + SOON_S) * np.sqrt(sizes)
-    return scores
+    return np.minimum(scores, MAX_SCORE) + spare
 
 
 _UNTIL_CLIENTS_MOVE: Final = Score(lambda some: eviction_scores(some, NOWHERE, 0.0))

@@ -24,8 +24,6 @@ from shmmap.errors import Busy
 from shmmap.protocol.messages import Holder
 from shmmap.segment.pins import LOADER_SLOT, has_slot, holders
 
-__all__ = ["UNKNOWN_SLOT", "Holders", "Share", "Survey", "Usage"]
-
 HOLDERS_S: Final = 0.03
 """Limit of processor time for finding the holders for one reply."""
 MAX_HOLDING_SEGMENTS: Final = 512

@@ -12,12 +12,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from typing import Final
 
 from shmmap.daemon.cache.eviction_order import EvictionOrder
 from shmmap.daemon.records import Key, Resident, Retired
 from shmmap.large_tables import ShardedDict
 
-__all__ = ["Ledger", "Segments"]
+_PLACES: Final = 1 << 32
 
 
 class Segments:
@@ -54,6 +55,25 @@ class Segments:
             at = len(alike)
             while (at := min(at, len(alike)) - 1) >= 0:  # from the end: what fills a gap was yielded
                 yield alike[at]
+
+    def page(self, start: int, most: int) -> tuple[list[Resident], int | None]:
+        """Return the next ``most`` segments in the order of `walk`, and where the next page starts.
+
+        Parameters
+        ----------
+        start
+            0, or what the last page gave: a size, shifted by 32 bits, and how many of that size are left.
+        """
+        size, left = divmod(start, _PLACES) if start > 0 else (len(self._by_size), 0)
+        found: list[Resident] = []
+        for at in range(min(size, len(self._by_size) - 1), -1, -1):
+            alike = self._by_size[at]
+            end = min(left, len(alike)) if at == size else len(alike)
+            begin = max(end - most + len(found), 0)
+            found += alike[begin:end][::-1]  # as in a walk, what fills a gap was given
+            if len(found) == most:
+                return found, at * _PLACES + begin
+        return found, None
 
 
 class Ledger:
@@ -129,12 +149,6 @@ class Ledger:
     def fits_at_all(self, nbytes: int) -> bool:
         """Whether ``nbytes`` fit beside the daemon's own overhead once everything else is evicted."""
         return nbytes + self.overhead_bytes <= self.budget_bytes
-
-    def add_overhead(self, nbytes: int) -> bool:
-        """Count more memory of the daemon itself; return False if it does not fit."""
-        fits = self.shortage(nbytes) <= 0
-        self.overhead_bytes += nbytes if fits else 0
-        return fits
 
     @property
     def resident_count(self) -> int:

@@ -17,8 +17,6 @@ from shmmap.daemon.turns import Walk
 from shmmap.logfmt import log
 from shmmap.quantities import format_bytes
 
-__all__ = ["LostSegments"]
-
 SETTLE_S: Final = 0.5
 """A cleaner removes files one after the other: the log line waits until none has vanished for this long."""
 LIKELY: Final = (

@@ -18,8 +18,6 @@ from shmmap.large_tables import ShardedDict
 from shmmap.origin.catalogue import CatalogueChange
 from shmmap.segment.version import Stamp
 
-__all__ = ["MapSwitch"]
-
 CELLS_REMEMBERED: Final = 2048
 """Changed cells remembered, over all states; for changes before these, clients read the whole list."""
 
@@ -149,10 +147,8 @@ class MapSwitch:
         index = cache.index_of(cell)
         if index is None or cache.catalogue.box(index) != resident.box:
             cache.reclaimer.retire(resident, now_s, "map")
-        elif cache.enter_if_current(resident, index):
-            cache.events.emit(cache.events.show, resident, "resident")
-        elif resident.checked:
-            cache.events.emit(cache.events.show, resident, "stale")
+        elif cache.enter_if_current(resident, index) or resident.checked:
+            return
         elif not cache.is_current(resident) and cache.layers.version(index, resident.key.layer):
             cache.reclaimer.retire(resident, now_s, "map")
 

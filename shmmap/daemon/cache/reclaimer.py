@@ -6,7 +6,7 @@ Each turn of the serving loop checks a bounded number of segments.
 After the renaming, no other process can open the segment; a second check on a later tick finds a process that
 was just opening it.  A retired segment that is still mapped stays in the ledger.  It is checked again when
 its reader reports a release, when the kernel reports a close, or when a client's session ends; a timer is
-only a precaution.
+only a precaution.  The memory of a large segment is freed in another thread, and counts as used until then.
 """
 
 from __future__ import annotations
@@ -32,8 +32,6 @@ from shmmap.daemon.turns import Walk
 from shmmap.logfmt import log
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.names import another_name, retired_name
-
-__all__ = ["Closer", "Reclaimer"]
 
 SMALL_BYTES: Final = 1 << 16
 MAX_WAITING: Final = 64
@@ -131,9 +129,6 @@ class RetirementObserver(Protocol):
     def segment_retired(self, resident: Resident, why: str) -> None:
         """Handle a segment that left service; ``why`` as in `Reclaimer.retire`."""
 
-    def segment_gone(self, name: str) -> None:
-        """Handle a name that has no segment any more: the segment was freed or renamed."""
-
 
 @dataclass(eq=False, slots=True)
 class Reclaimer:
@@ -196,7 +191,6 @@ class Reclaimer:
             log.warning("segment not renamed", old=old, new=retired_name(old), error=error.strerror)
             found = self.directory.rename(old, retired_name(new))
             self.ledger.rename(resident, new)
-            self.observer.segment_gone(old)
             return found
 
     def _watch(self, resident: Resident, now_s: float, why: str, *, found: bool) -> bool:
@@ -287,7 +281,6 @@ class Reclaimer:
             session = self.sessions.by_slot(slot)
             if session is not None:
                 session.drop_segment(resident)
-        self.observer.segment_gone(resident.name)
 
     # --- freeing ------------------------------------------------------------------------------
 

@@ -16,9 +16,6 @@ from shmmap.large_tables import ShardedDict, sparse_zeros
 from shmmap.protocol.codec import encode_handle
 from shmmap.protocol.messages import Handle
 
-__all__ = ["Heights", "WarmIndex"]
-
-
 TABLES_BYTES: Final = 64 << 20
 """Memory of all tables; each takes 8 bytes per cell of the map, but untouched pages of it take none."""
 LEAST_TABLES: Final = 4

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reports about cells: as events, log lines, counters, and rows of the statistics.
+"""Reports about cells: as events, log lines and counters.
 
 Nothing is reported while a client waits for the loop: `CellEvents.emit` queues it, `CellEvents.flush`
 reports.
@@ -20,10 +20,7 @@ from shmmap.daemon.transport.sessions import Session
 from shmmap.layers.points import LAYER
 from shmmap.logfmt import log
 from shmmap.protocol import events
-from shmmap.protocol.rows import CellRow, CellState
 from shmmap.statistics.writer import StatisticsWriter
-
-__all__ = ["CellEvents", "EvictionHistory", "PrefetchMisses", "PressureEvents"]
 
 MAX_EVICTED: Final = 1 << 14
 """Number of segments evicted for lack of memory that are remembered."""
@@ -211,8 +208,8 @@ class CellEvents:
     ----------
     pressure
         Reports cells that were refused for lack of memory.
-    id_prefix, segment_prefix
-        Prefixes that are removed from the cell ids and segment names in reports.
+    id_prefix
+        Prefix that is removed from the cell ids in reports.
 
     Attributes
     ----------
@@ -227,12 +224,11 @@ class CellEvents:
         pressure: PressureEvents,
         *,
         id_prefix: str,
-        segment_prefix: str,
     ) -> None:
         self._log = event_log
         self._statistics = statistics
         self._pressure = pressure
-        self._id_prefix, self._segment_prefix = id_prefix, segment_prefix
+        self._id_prefix = id_prefix
         self.minutes = MinuteLog()
         self._misses = PrefetchMisses(event_log)
         self._history = EvictionHistory()
@@ -359,30 +355,3 @@ class CellEvents:
     def prefetch_missed(self, session: Session, key: Key) -> None:
         """Count and report that a moving client has to wait for a cell, unless it waits already."""
         self._statistics.add("prefetch_misses", self._misses.note(session, self._id(key.cell_id), key.layer))
-
-    # --- rows of the statistics ---------------------------------------------------------------------
-
-    def show(self, resident: Resident, state: CellState) -> None:
-        """Write the row of a segment in its present state."""
-        self._statistics.cell_changed(resident.name, self.row(resident, state))
-
-    def row(self, resident: Resident, state: CellState) -> CellRow:
-        """Return the row of a segment for the statistics."""
-        return CellRow(
-            self._id(resident.key.cell_id),
-            resident.key.layer,
-            resident.version,
-            resident.name.removeprefix(self._segment_prefix),
-            state,
-            resident.nbytes,
-            resident.points,
-            resident.box,
-            resident.hits,
-            int(resident.last_use_s * 1e9),
-            resident.load_ns,
-            ahead=resident.prefetched and state == "resident",
-        )
-
-    def hide(self, name: str) -> None:
-        """Remove the row of a segment that no longer exists."""
-        self._statistics.cell_removed(name)

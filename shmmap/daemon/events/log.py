@@ -24,8 +24,6 @@ from shmmap.protocol import events
 from shmmap.protocol.events import EventPage, Recent, encode_event
 from shmmap.statistics.writer import StatisticsWriter
 
-__all__ = ["EventLog", "MinuteLog", "event_listener", "events_path"]
-
 REMEMBERED: Final = 4096
 """Events stored for later requests and slow subscribers: less than a megabyte."""
 PAGE_EVENTS: Final = 500
@@ -78,20 +76,24 @@ class EventLog:
         self._subscribers.pop(subscriber, None)
         self._slow.pop(subscriber, None)
 
-    def resume(self, subscriber: Subscriber) -> None:
-        """Send a slow subscriber the stored events that it lacks: it has read all that was sent."""
+    def resume(self, subscriber: Subscriber) -> bool:
+        """Send a slow subscriber, which has read all that was sent, some of the stored events that it lacks.
+
+        Returns whether it lacks more, and has room for them.
+        """
         number = self._slow.pop(subscriber, None)
         if number is None:
-            return
+            return False
         first = self.last - len(self._kept) + 1
         number = max(number, first)
-        while number <= self.last:
-            some = list(itertools.islice(self._kept, number - first, number - first + SENT_TOGETHER))
-            number += len(some)
-            if not subscriber.offer(data for _at_ns, data in some):
-                self._slow[subscriber] = number
-                return
-        self._subscribers[subscriber] = None
+        some = list(itertools.islice(self._kept, number - first, number - first + SENT_TOGETHER))
+        number += len(some)
+        taken = subscriber.offer(data for _at_ns, data in some)
+        if taken and number > self.last:
+            self._subscribers[subscriber] = None
+            return False
+        self._slow[subscriber] = number
+        return taken
 
     def close(self) -> None:
         """Stop sending events."""

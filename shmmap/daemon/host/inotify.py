@@ -9,22 +9,6 @@ import os
 import struct
 from typing import Final, NamedTuple
 
-__all__ = [
-    "ALSO",
-    "CHANGED",
-    "CLOSED",
-    "CREATED",
-    "DIRECTORY",
-    "ENDED",
-    "NAMES_CHANGED",
-    "NAME_GONE",
-    "OVERFLOW",
-    "SELF_GONE",
-    "SELF_MOVED",
-    "Event",
-    "Inotify",
-]
-
 CLOSED: Final = 0x08 | 0x10
 """A file was closed, whether it was open for writing or not: IN_CLOSE."""
 NAME_GONE: Final = 0x40 | 0x200

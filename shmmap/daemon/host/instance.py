@@ -23,8 +23,6 @@ from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.names import name_taken, segment_prefix, statistics_name
 from shmmap.statistics.exclusive_name import has_writer
 
-__all__ = ["InstanceLock", "lock_path", "make_runtime_dir", "stopped_early", "take_away"]
-
 
 def make_runtime_dir(path: Path, gid: int) -> None:
     """Make the directory of the socket, for the owner and, if given, the group.

@@ -15,16 +15,6 @@ from shmmap.errors import CannotStart, ConfigError
 from shmmap.mounts import control_groups, group_values
 from shmmap.segment.directory import ShmDirectory
 
-__all__ = [
-    "choose_budget",
-    "loader_bytes",
-    "memory_limit_bytes",
-    "out_of_memory_kills",
-    "room_bytes",
-    "room_in_group",
-    "usable_bytes",
-]
-
 DEFAULT_CEILING_BYTES: Final = 4 << 30
 RESERVE_BYTES: Final = 256 << 20
 SMALLEST_BYTES: Final = 1 << 20

@@ -19,8 +19,6 @@ import platform
 import struct
 from typing import Final
 
-__all__ = ["SERVING_SLICE_NS", "slice_ns", "take_slices", "weigh_less"]
-
 SERVING_SLICE_NS: Final = 100_000
 """The shortest slice that the kernel grants (``kernel/sched/syscalls.c``)."""
 

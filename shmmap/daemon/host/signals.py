@@ -13,8 +13,6 @@ from typing import Final
 
 from shmmap.logfmt import log
 
-__all__ = ["KEEP_SIGNAL", "RELOAD_SIGNAL", "STOP_SIGNALS", "ServingSignals", "StartSignals", "ignore_signals"]
-
 STOP_SIGNALS: Final = (signal.SIGTERM, signal.SIGINT)
 KEEP_SIGNAL: Final = signal.SIGUSR1
 """Ends the daemon and leaves the segments to the next run, see `shmmap.daemon.main`."""

@@ -33,8 +33,6 @@ from shmmap.chunks.layout import (
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.errors import BadRequest, CannotStart, SegmentCorrupt
 
-__all__ = ["ChunkFile", "ChunkMemory", "live_prefix", "map_chunk", "memory_bytes", "unmap_chunk", "view_at"]
-
 _GROWTH_BRICKS: Final = 8
 """Bricks by which a chunk grows: one page, the unit of allocation."""
 _RECORDS: Final = ("undo", "applied")

@@ -14,25 +14,6 @@ import msgspec
 from shmmap.daemon.config_live import LiveSettings
 from shmmap.protocol.live import LiveMapRow
 
-__all__ = [
-    "MAX_PER_SESSION",
-    "Ask",
-    "Begin",
-    "Begun",
-    "Disconnected",
-    "End",
-    "Ended",
-    "FromLive",
-    "Reply",
-    "Status",
-    "ToLive",
-    "Unsaved",
-    "decode_from_live",
-    "decode_to_live",
-    "encode",
-    "not_served",
-]
-
 
 class Begin(msgspec.Struct, array_like=True, tag="begin"):
     """Load these maps into memory, and serve them.

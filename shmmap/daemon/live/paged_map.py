@@ -36,8 +36,6 @@ from shmmap.daemon.live.paging.residency import RETRY_S, Limits, Residency
 from shmmap.errors import CannotStart, PackageMissing, SegmentCorrupt
 from shmmap.logfmt import log
 
-__all__ = ["FileThreads", "Job", "Observer", "PagedMap"]
-
 T = TypeVar("T")
 
 THREADS: Final = 4
@@ -52,8 +50,6 @@ LOOK_S: Final = 2.0
 """Interval of checks whether the directory was moved or replaced."""
 HANGS_S: Final = 10.0
 """Time without an answer after which a disk counts as hanging."""
-MAX_UNFLUSHED: Final = 32 << 20
-"""Most bytes written and not flushed; beyond that, saving pauses until the disk has caught up."""
 
 
 class Job(NamedTuple):
@@ -172,8 +168,7 @@ class PagedMap:
     Attributes
     ----------
     stored : KeyIndex
-        Chunks that have files, in order; a chunk whose file was quarantined stays included until it is
-        loaded.
+        Chunks that are saved, in order.
     problems : dict
         Problems that keep chunks from being loaded or saved at present.
     saved_s : float
@@ -339,6 +334,8 @@ class PagedMap:
         """Do what can be done now, without waiting for the disk."""
         self._threads.deliver(now_s)
         self._check_directory(now_s, save_all=save_all)
+        while self.files.found_lost:
+            self.note_lost(self.files.found_lost.popleft(), now_s)
         residency = self.residency
         for chunk, scan in residency.ready()[:CHUNKS_PER_TURN]:
             self._apply(chunk, scan, now_s, now_ns)
@@ -352,10 +349,7 @@ class PagedMap:
             jobs.append(Job(partial(self._load, identity), partial(self._loaded, cold)))
         self._threads.start(jobs)
         jobs = []
-        while (
-            self.files.unflushed_bytes < MAX_UNFLUSHED
-            and (dirty := residency.next_save(now_s, everything=save_all)) is not None
-        ):
+        while (dirty := residency.next_save(now_s, everything=save_all)) is not None:
             view = self.chunks[dirty.key].view
             copy = ChunkView(bytes(view.data[: chunk_bytes(int(view.state["bricks"]))]))
             saved = partial(self._saved, dirty, dirty.version)
@@ -521,20 +515,20 @@ class PagedMap:
         for scan in self.residency.durability.flushed():
             self._observer.scan_durable(scan)
 
-    def list_files(self, applied: dict[int, int] | None) -> None:
-        """Write the manifest in a file thread; ``applied`` as in `MapFiles.write_manifest`."""
-        self._threads.start([Job(partial(self.files.write_manifest, applied), self._listed)])
+    def write_record(self, applied: dict[int, int] | None) -> None:
+        """Write the record in a file thread; ``applied`` as in `MapFiles.write_record`."""
+        self._threads.start([Job(partial(self.files.write_record, applied), self._recorded)])
 
-    def _listed(self, future: Future[None], now_s: float) -> None:
+    def _recorded(self, future: Future[None], now_s: float) -> None:
         del now_s
         if error := future.exception():
-            log.warning("manifest not written", reason=str(error))
+            log.warning("record of a live map not written", reason=str(error))
 
     # --- the end --------------------------------------------------------------------------------
 
     def finish(self, applied: dict[int, int] | None) -> None:
-        """Write the manifest and remove spare files, at the end."""
-        self._threads.start([Job(partial(self._finish, applied), self._listed)])
+        """Write the record and bring the log into the database, at the end."""
+        self._threads.start([Job(partial(self._finish, applied), self._recorded)])
         while not self._threads.are_idle and (left_s := self._left_s()) > 0:
             self._threads.wait(left_s)
             self._threads.deliver(time.monotonic())
@@ -546,8 +540,8 @@ class PagedMap:
         return max(0.0, self._end_s - time.monotonic())
 
     def _finish(self, applied: dict[int, int] | None) -> None:
-        self.files.write_manifest(applied)
-        self.files.remove_spare()
+        self.files.write_record(applied)
+        self.files.finish()
 
     def remove_from_memory(self) -> None:
         """Evict all chunks."""
@@ -560,6 +554,7 @@ class PagedMap:
         for done in self._threads.close(self._left_s()):
             if isinstance(done, ChunkFile):
                 done.close()  # loaded after the last turn
+        self.files.close(self._left_s())
         for file in self.chunks.values():
             file.close()
         self.chunks.clear()

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The daemon's side of the live worker: forwards requests to it, and its answers to clients.
 
-It publishes changes of live maps as events and in the statistics.
+It publishes changes of live maps as events.
 
 A worker that dies loses nothing that it had answered: a new worker is started, which finds the chunks in
 memory.  Unanswered requests are refused, and their clients repeat them.
@@ -37,8 +37,6 @@ from shmmap.protocol.codec import encode
 from shmmap.protocol.live import LiveList, LiveListed, LiveRequest
 from shmmap.protocol.rows import LiveMapRow
 from shmmap.statistics.writer import StatisticsWriter
-
-__all__ = ["LiveEvents", "LiveRelay", "NoLiveMaps", "Tickets"]
 
 _CHUNK: Final = re.compile(r"chunk -?\d+_-?\d+_-?\d+")
 
@@ -82,7 +80,6 @@ class LiveEvents:
     def update(self, rows: Sequence[LiveMapRow]) -> None:
         """Report the present state of the maps."""
         self._rows = {row.name: row for row in rows}
-        self.statistics.show_live_maps(rows)
         if self._begun:
             self._publish_changes()
 

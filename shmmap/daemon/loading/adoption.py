@@ -37,8 +37,6 @@ from shmmap.segment.header import read_header
 from shmmap.segment.layout import SegmentHeader
 from shmmap.segment.names import is_retired, retired_name, segment_prefix, statistics_name
 
-__all__ = ["Adoption"]
-
 NOT_IN_MAP: Final = "its cell is not in the map"
 CHANGED: Final = "its cell, or one around it, has changed"
 UNDECIDED: Final = (NOT_IN_MAP, CHANGED)

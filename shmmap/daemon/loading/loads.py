@@ -16,11 +16,10 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from shmmap.daemon.cache.ledger import Ledger
+from shmmap.daemon.loading.link import Link
 from shmmap.daemon.records import SPACE_CODES, Failure, Key, Load, Resident
 from shmmap.layers.points import LAYER
 from shmmap.segment.version import Stamp
-
-__all__ = ["BACKGROUND", "LoadQueue", "Loads"]
 
 BACKGROUND: Final = 1e12
 """Priority from which on no client waits for a load."""
@@ -168,13 +167,15 @@ class Loads:
     ----------
     ledger
         Reserves the bytes of running loads.
+    link
+        Counts what running loads fetch from a remote origin; None if cells are files.
 
     ``by_key`` contains the loads that have not ended; ``failures`` contains why the last load of a key
     failed, until a load succeeds or the cause may have passed.
     """
 
-    def __init__(self, ledger: Ledger) -> None:
-        self._ledger = ledger
+    def __init__(self, ledger: Ledger, link: Link | None = None) -> None:
+        self._ledger, self._link = ledger, link
         self.by_key: dict[Key, Load] = {}
         self.failures: dict[Key, Failure] = {}
         self._keys_failed: dict[str, OrderedDict[Key, None]] = {}  # by code, oldest first
@@ -215,7 +216,7 @@ class Loads:
             load = self.by_key[key] = Load(
                 key, estimate, priority, self._numbers, asker=asker, computed=computed
             )
-        load.prefetch = False
+        load.prefetch = load.spare = False
         if load.running:
             load.wanted = True
             return load
@@ -227,6 +228,12 @@ class Loads:
         """Queue a load that no client has asked for yet, after all loads that clients ask for."""
         load = self.want(key, estimate, PREFETCH + needed_in_s, PREFETCH, computed=computed)
         load.wanted, load.prefetch = False, True
+        return load
+
+    def spare(self, key: Key, estimate: int, asker: Hashable, *, computed: bool) -> Load:
+        """Queue a load for a spare request, after all loads that clients ask for."""
+        load = self.want(key, estimate, BACKGROUND, asker, computed=computed)
+        load.spare = True
         return load
 
     def is_promised(self, key: Key) -> bool:
@@ -253,6 +260,9 @@ class Loads:
             return False
         self._queue.started(load)
         load.running, load.started_s, load.reserved = True, now_s, load.estimate
+        if self._link is not None and load.link_bytes:
+            ahead = load.prefetch or load.spare
+            self._link.begin(load, load.link_bytes, now_s, "ahead" if ahead else "demand")
         return True
 
     def grow(self, load: Load, nbytes: int) -> bool:
@@ -277,6 +287,8 @@ class Loads:
         if load.running:
             load.running = False
             self._queue.ended(load)
+            if self._link is not None:
+                self._link.end(load)
 
     def finish(self, load: Load, failure: Failure | None = None) -> None:
         """End a load; a ``failure`` stays until a load of the key succeeds or it is cleared."""

@@ -30,9 +30,6 @@ from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.travel.motion import Motion
 from shmmap.geometry import Area
 
-__all__ = ["PASS_S", "URGENT_S", "ClientPath", "LookAhead", "OriginHealth", "Prefetch", "Wish"]
-
-
 LOADS: Final = 64
 """Number of recent loads from which the time of a load is estimated."""
 IN_A_ROW: Final = 4
@@ -408,13 +405,16 @@ class Prefetch:
             self._uncompared.pop()
         return not self._uncompared
 
-    def _is_back(self, now_s: float) -> bool:
-        """Whether loads succeed again after an outage; note how long the outage was."""
+    def note_origin(self, now_s: float) -> None:
+        """Note whether the origin is out, also while no wish may begin."""
         if self.health.is_out:
             # loads fail after a delay: the server was already silent when they began
             self._out_since_s = min(self._out_since_s, now_s - self.health.waited_s)
-            return False
-        if self._out_since_s == math.inf:
+
+    def _is_back(self, now_s: float) -> bool:
+        """Whether loads succeed again after an outage; note how long the outage was."""
+        self.note_origin(now_s)
+        if self.health.is_out or self._out_since_s == math.inf:
             return False
         away_s, self._out_since_s = now_s - self._out_since_s, math.inf
         if away_s > SLACK_S:  # a single lost answer does not show how long outages are

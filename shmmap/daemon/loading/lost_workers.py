@@ -18,8 +18,6 @@ from shmmap.quantities import format_bytes
 from shmmap.segment.version import Stamp
 from shmmap.statistics.writer import StatisticsWriter
 
-__all__ = ["LostWorkers"]
-
 KILLED: Final = "signal SIGKILL"
 OUT_OF_MEMORY: Final = "out of memory"
 START_ATTEMPTS: Final = 3

@@ -4,7 +4,7 @@
 `DiskAhead` fetches onto the disk cells that do not fit in memory.  It follows the same paths as `Prefetcher`,
 as far ahead, and begins where `Prefetcher` has no memory left.  It fetches the objects of cells that are
 neither in memory nor on the disk, in the order in which they will be needed, and only while no load waits for
-a loader.
+a loader and the link has room (`shmmap.daemon.loading.link`).
 """
 
 from __future__ import annotations
@@ -22,9 +22,6 @@ from shmmap.daemon.map.origin_link import OriginLink
 from shmmap.daemon.records import Key
 from shmmap.layers.points import LAYER
 from shmmap.origin.remote.published_object import ObjectName, unpack_source
-
-__all__ = ["DiskAhead", "OriginWatch"]
-
 
 LOOK_S: Final = 0.25
 """Interval of checking whether memory has room and whether loads wait, seconds."""
@@ -104,8 +101,10 @@ class DiskAhead:
     def run_step(self, now_s: float) -> None:
         """Start fetching one layer of a cell, if memory has no room for it and no load waits."""
         self._now_s = now_s
+        link = self._scheduler.link
         is_asked = now_s >= self._resume_s and self._scheduler.prefetcher.lacks_room(now_s)
-        if not is_asked or len(self._scheduler.loads):
+        may_begin = link is None or link.may_begin(now_s, ahead=True)
+        if not is_asked or len(self._scheduler.loads) or not may_begin:
             self._prefetch.restart()  # so that its catalogue can be freed
             if not is_asked:
                 self._forget()
@@ -126,13 +125,18 @@ class DiskAhead:
         self._lacking.add((wish.cell, wish.layer))
         self._rest[wish.cell, wish.layer] = math.inf
         key = KeptCell(catalogue.map_version, wish.cell, wish.layer)
-        self._keeper.keep(key, self._objects(wish.cell, wish.layer))
+        objects = self._objects(wish.cell, wish.layer)
+        if link is not None:
+            link.begin(key, sum(one.size for one in objects), now_s, "ahead")
+        self._keeper.keep(key, objects)
         self._next_s = now_s
 
     def collect(self) -> None:
         """Note the objects that have been fetched."""
         for kept in self._keeper.take():
             map_version, cell, layer = kept.key
+            if self._scheduler.link is not None:
+                self._scheduler.link.end(kept.key, kept.received)
             if map_version == self._map_version:
                 self._rest[cell, layer] = self._now_s + (KEPT_S if kept.is_here else AGAIN_S)
                 if kept.is_here:

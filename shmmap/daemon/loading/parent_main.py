@@ -33,8 +33,6 @@ from shmmap.processes.end_with_parent import die_with
 from shmmap.processes.start_child import channel_to_parent, receive_packet
 from shmmap.version import __version__
 
-__all__ = ["main"]
-
 MAX_SETTINGS_BYTES: Final = 1 << 14
 _OOM_SCORE: Final = b"500"  # if memory runs out, the kernel should kill a loader, not the daemon
 _MAX_NICE: Final = 19

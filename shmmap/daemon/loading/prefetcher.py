@@ -15,13 +15,12 @@ from collections import deque
 from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
+from shmmap.daemon.loading.link import Link
 from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.loading.look_ahead import URGENT_S, Prefetch
 from shmmap.daemon.loading.worker_pool import WorkerPool
 from shmmap.daemon.records import Key, Load, Resident
 from shmmap.daemon.transport.sessions import MOVES_PER_STEP, Session
-
-__all__ = ["Prefetcher"]
 
 MAX_PATHS: Final = 256
 """Clients for which cells are prefetched; each adds a comparison to every wish."""
@@ -52,9 +51,16 @@ class Prefetcher:
     """
 
     def __init__(
-        self, cache: CellCache, loads: Loads, pool: WorkerPool, *, share: float, outage_tolerance_s: float
+        self,
+        cache: CellCache,
+        loads: Loads,
+        pool: WorkerPool,
+        link: Link | None = None,
+        *,
+        share: float,
+        outage_tolerance_s: float,
     ) -> None:
-        self._cache, self._loads, self._pool = cache, loads, pool
+        self._cache, self._loads, self._pool, self._link = cache, loads, pool, link
         self._sessions, self._ledger, self._evictor = cache.sessions, cache.ledger, cache.evictor
         self._layers, self._events, self._statistics = cache.layers, cache.events, cache.statistics
         self.cold: deque[tuple[Session, Key]] = deque(maxlen=MAX_COLD)
@@ -126,16 +132,18 @@ class Prefetcher:
         self._count_misses()
         while self.ended:
             self._learn(*self.ended.popleft())
+        self.prefetch.note_origin(now_s)
         if now_s < self._full_until_s:
             self._next_s = self._full_until_s
         elif not self._may_begin():
-            self._next_s = math.inf  # until a load ends
+            self._next_s = self._link.rests_until_s if self._link is not None else math.inf  # or a load ends
         else:
             self._wish(now_s)
 
     def _may_begin(self) -> bool:
-        """Whether a loader could begin another load."""
-        return not len(self._loads) and self._pool.free_places > 0
+        """Whether a loader and the link could begin another load."""
+        may = not len(self._loads) and self._pool.free_places > 0
+        return may and (self._link is None or self._link.may_begin(self._now_s, ahead=True))
 
     @property
     def kept_places(self) -> int:

@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The daemon's side of the process that loaders are forked from (`shmmap.daemon.loading.parent_main`)."""
+"""The daemon's side of the process that loaders are forked from (`shmmap.daemon.loading.parent_main`).
+
+Loaders are not children of the daemon: a fork of it would copy its sockets, its map and its threads.  The
+first parent is forked from the daemon before it has any of these, so that what both need is imported once; a
+replacement is a new process.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +20,6 @@ from shmmap.installed import RESTART, is_replaced
 from shmmap.logfmt import log
 from shmmap.processes.start_child import ForkedProcess, fork_child, how_ended, receive_packet, start_child
 from shmmap.version import __version__
-
-__all__ = ["Early", "PreparedParent", "fork_early"]
 
 Early: TypeAlias = tuple[ForkedProcess, socket.socket]
 """A parent without settings yet, and the channel to it."""

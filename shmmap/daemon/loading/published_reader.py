@@ -11,13 +11,14 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, TypeAlias
 
+from shmmap.daemon.loading import worker_messages
 from shmmap.errors import LoadFailed, MapDataError, Offline, ShmmapError
 from shmmap.layers.contract import Box
 from shmmap.layers.points import LAYER
 from shmmap.layers.sources import CellJob, CellSource
-from shmmap.layers.spec import LayerSpec
+from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.origin.remote.object_tier import KeptObjects, ObjectCounts, kept_objects
 from shmmap.origin.remote.opened_store import ServedFrom, open_for_serving
 from shmmap.origin.remote.published_object import (
@@ -29,12 +30,10 @@ from shmmap.origin.remote.published_object import (
     unpack_source,
     write_segment,
 )
-from shmmap.origin.remote.transport import Incomplete
+from shmmap.origin.remote.transport import Incomplete, reporting_bytes
 from shmmap.origin.remote.zstd_frame import DAMAGED, unpack_frame
 from shmmap.segment.layout import SegmentHeader
 from shmmap.segment.version import Source, Stamp
-
-__all__ = ["CONCURRENT_FETCHES", "PublishedReader"]
 
 CONCURRENT_FETCHES: Final = 32
 """Limit of small objects that a loader fetches concurrently."""
@@ -44,6 +43,8 @@ SLOW_S: Final = 0.75
 """How long an object takes a place from others, seconds."""
 FAILED_LATELY_S: Final = 60.0
 """How long an object that could not be fetched takes no place from others, seconds."""
+REPORTED_S: Final = 0.05
+"""Interval of reporting bytes while they come, seconds."""
 _STACK_BYTES: Final = 512 << 10
 """Stack of a thread; small, because it counts in full towards the loader's memory limit."""
 
@@ -52,7 +53,8 @@ _STACK_BYTES: Final = 512 << 10
 class _Fetch:
     """An object that jobs need; ``frame`` is its data, or why the fetch failed; None until then.
 
-    ``is_slow``: it has taken no place from others since it was found slow.
+    ``is_slow``: it has taken no place from others since it was found slow.  ``received``: bytes that have
+    come over the link and were not reported with a job.
     """
 
     name: ObjectName
@@ -60,7 +62,48 @@ class _Fetch:
     begun: bool = False
     begun_s: float = 0.0
     is_slow: bool = False
+    received: int = 0
     frame: memoryview | ShmmapError | None = None
+
+
+Report: TypeAlias = Callable[[worker_messages.Arrived | worker_messages.Fetched], None]
+"""Sends a message to the daemon; called in any thread."""
+
+
+def needed_bytes(job: worker_messages.Job) -> int:
+    """Return the bytes of the objects that a job is made from."""
+    if job.points and not job.neighbours:
+        return 0
+    return sum(name.size for name in _needed(layer_spec(job.layer), job))
+
+
+class _Reports:
+    """Reports bytes as they come, not more often than the daemon needs them."""
+
+    def __init__(self, report: Report) -> None:
+        self.send = report
+        self._lock = threading.Lock()
+        self._bytes, self._delays_s = 0, list[float]()
+        self._sent_s = -math.inf
+
+    def add(self, nbytes: int, delay_s: float | None) -> None:
+        """Note bytes, and after how long their answer began if they are the first of it."""
+        with self._lock:
+            self._bytes += nbytes
+            self._delays_s += [delay_s] if delay_s is not None else []
+            if time.monotonic() >= self._sent_s + REPORTED_S:
+                self._flush()
+
+    def flush(self) -> None:
+        """Report what was not reported yet."""
+        with self._lock:
+            self._flush()
+
+    def _flush(self) -> None:
+        if self._bytes:
+            self._sent_s = time.monotonic()
+            self.send(worker_messages.Arrived(self._bytes, tuple(self._delays_s)))
+            self._bytes, self._delays_s = 0, []
 
 
 def _get(objects: KeptObjects, name: ObjectName) -> memoryview:
@@ -84,10 +127,15 @@ class ObjectFetcher:
     fetches that have not begun fail too: else the jobs would fail one after the other, each after its own
     timeout.  Objects that have been on their way for long, or have failed lately, take neither places nor
     bytes from others.
+
+    Parameters
+    ----------
+    report
+        Reports bytes as they come, and jobs that need the origin no more.
     """
 
-    def __init__(self, objects: KeptObjects) -> None:
-        self._objects = objects
+    def __init__(self, objects: KeptObjects, report: Report = lambda _message: None) -> None:
+        self._objects, self._reports = objects, _Reports(report)
         self._lock = threading.Lock()
         threading.stack_size(_STACK_BYTES)
         self._threads = ThreadPoolExecutor(
@@ -143,8 +191,15 @@ class ObjectFetcher:
     def _fetch(self, fetch: _Fetch) -> None:
         """Fetch an object, in a thread."""
         frame: memoryview | ShmmapError
+
+        def arrived(nbytes: int) -> None:
+            delay_s = time.monotonic() - fetch.begun_s if not fetch.received else None
+            fetch.received += nbytes
+            self._reports.add(nbytes, delay_s)
+
         try:
-            frame = _get(self._objects, fetch.name)
+            with reporting_bytes(arrived):
+                frame = _get(self._objects, fetch.name)
         except ShmmapError as error:
             frame = error
         except BaseException as error:  # noqa: BLE001  also panics: else the job would wait without bound
@@ -183,7 +238,12 @@ class ObjectFetcher:
         self._begin_some()
 
     def _finish_if_complete(self, number: int) -> None:
-        if all(self._fetches[digest].frame is not None for digest in self._needs[number]):
+        fetches = [self._fetches[digest] for digest in self._needs[number]]
+        if all(fetch.frame is not None for fetch in fetches):
+            self._reports.flush()
+            self._reports.send(worker_messages.Fetched(number, sum(fetch.received for fetch in fetches)))
+            for fetch in fetches:
+                fetch.received = 0
             self._done.append(number)
             os.eventfd_write(self.fd, 1)
 
@@ -228,7 +288,7 @@ class ObjectFetcher:
             self._finish_if_complete(number)
 
 
-def _needed(spec: LayerSpec, job: CellJob) -> Iterator[ObjectName]:
+def _needed(spec: LayerSpec, job: CellJob | worker_messages.Job) -> Iterator[ObjectName]:
     """Yield the objects that a layer of a cell is made from."""
     own = unpack_source(job.source)
     if job.ready:
@@ -242,12 +302,18 @@ def _needed(spec: LayerSpec, job: CellJob) -> Iterator[ObjectName]:
 class PublishedReader:
     """Reads sources stored as objects of a published map; see `shmmap.layers.sources.SourceReader`."""
 
-    def __init__(self, served: ServedFrom, cache_dir: str, cache_bytes: int) -> None:
+    def __init__(
+        self,
+        served: ServedFrom,
+        cache_dir: str,
+        cache_bytes: int,
+        report: Report = lambda _message: None,
+    ) -> None:
         store = open_for_serving(served)
         self._url = store.url
         self._objects = kept_objects(store, cache_dir, cache_bytes, quiet=True)
         self._counts = ObjectCounts()
-        self.fetcher = ObjectFetcher(self._objects)
+        self.fetcher = ObjectFetcher(self._objects, report)
 
     def stamp(self, source: Source) -> Stamp:
         """Return the stamp of a source, whose objects never change."""

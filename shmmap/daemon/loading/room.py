@@ -19,8 +19,6 @@ from shmmap.daemon.records import Load, Resident
 from shmmap.daemon.turns import WatchedDescriptors
 from shmmap.quantities import format_bytes
 
-__all__ = ["Room"]
-
 AHEAD_SHARE: Final = 32
 """Fraction of the budget (1/32) up to which memory is also freed for loads that follow the next one."""
 AGAIN_S: Final = 0.05
@@ -83,6 +81,8 @@ class Room:
         if load.prefetch:
             has_room = self.prefetcher.make_room(load, shortage, now_s)
             return "" if has_room else "it will be needed later than others"
+        if load.spare:
+            return "no memory is free"
         if not ledger.fits_at_all(load.estimate):
             needed, budget = format_bytes(load.estimate), format_bytes(ledger.budget_bytes)
             return f"the cell needs {needed}, the whole budget is {budget}"
@@ -127,6 +127,8 @@ class Room:
                     shortage = ledger.shortage(nbytes - load.reserved)
                     if load.prefetch:
                         freed = self.prefetcher.make_room(load, shortage, now_s)
+                    elif load.spare:
+                        freed = False
                     else:
                         freed = self.evictor.free(shortage, now_s) or self._may_be_given_back()
                     if freed:

@@ -8,6 +8,7 @@ long.
 
 from __future__ import annotations
 
+import math
 import os
 from collections import deque
 from collections.abc import Callable, Hashable, Iterator
@@ -16,23 +17,25 @@ from typing import Final, Protocol
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.map_switch import MapSwitch
+from shmmap.daemon.loading.link import Link
 from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.loading.lost_workers import LostWorkers
 from shmmap.daemon.loading.prefetcher import Prefetcher
 from shmmap.daemon.loading.room import Room
 from shmmap.daemon.loading.worker_messages import (
+    Arrived,
     Begun,
     Check,
     Checked,
     Compiling,
     Done,
-    Ended,
     Failed,
+    Fetched,
     Job,
     Need,
-    Ready,
 )
 from shmmap.daemon.loading.worker_pool import NOT_OPENED, Opened, Worker, WorkerPool
+from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.records import SPACE_CODES, Failure, Key, Load, Resident, failure_code
 from shmmap.errors import Replaced
 from shmmap.failpoints import step
@@ -41,15 +44,8 @@ from shmmap.large_tables import ShardedDict
 from shmmap.layers.points import LAYER
 from shmmap.layers.sources import Neighbour
 from shmmap.logfmt import log
-from shmmap.processes.start_child import how_ended
 from shmmap.segment.process_limits import limit_behind
 from shmmap.segment.version import Stamp
-
-__all__ = [
-    "MisplacedCells",
-    "Scheduler",
-]
-
 
 LOOKS_PER_PUMP: Final = 16
 """Loads, and misplaced cells, that one `pump` checks for having left the map."""
@@ -102,6 +98,35 @@ class MisplacedCells:
         self._cache.statistics.set("cells_outside_box", len(self._versions))
 
 
+def job_of(cache: CellCache, number: int, index: int, layer: str, granted: int) -> Job:
+    """Return a worker's job for a layer of a cell."""
+    catalogue = cache.catalogue
+    ready = catalogue.ready(index, layer)
+    points = cache.warm.get(index, LAYER) if layer != LAYER else None
+    return Job(
+        number,
+        catalogue.id(index),
+        catalogue.source(index),
+        layer,
+        catalogue.box(index),
+        catalogue.frame_id,
+        granted,
+        points=points.name if points is not None else "",
+        neighbours=tuple(
+            Neighbour.of(catalogue.id(near), catalogue.source(near), catalogue.box(near))
+            for near in cache.layers.neighbours(index, layer)
+        ),
+        ready=ready.version if ready is not None else 0,
+    )
+
+
+def opened_of(catalogue: CatalogueView) -> Opened:
+    """Return the directory through which files of a map are read."""
+    if catalogue.opened is None:
+        return NOT_OPENED
+    return catalogue.opened.innermost(catalogue.id_prefix.rstrip("/"))
+
+
 class LoadObserver(Protocol):
     """Is notified of loads."""
 
@@ -120,6 +145,8 @@ class Scheduler:
         The serving loop's clock, seconds.
     prefetch_share, outage_tolerance_s
         See `Prefetcher`.
+    link, needed_bytes
+        Budget of the link to a remote origin, and what a job fetches over it; None if cells are files.
 
     Attributes
     ----------
@@ -142,18 +169,21 @@ class Scheduler:
         clock: Callable[[], float],
         prefetch_share: float = 0.0,
         outage_tolerance_s: float = 0.0,
+        link: Link | None = None,
+        needed_bytes: Callable[[Job], int] | None = None,
     ) -> None:
         self._cache, self._map_switch, self._observer = cache, map_switch, observer
         self._ledger, self._layers = cache.ledger, cache.layers
         self._events, self._statistics = cache.events, cache.statistics
-        self.loads = Loads(cache.ledger)
+        self.link, self._needed_bytes, self._link_s = link, needed_bytes, math.inf
+        self.loads = Loads(cache.ledger, link)
         self.pool = pool = make_pool(lambda worker: self.on_worker(worker, clock()))
         self._jobs: dict[int, Load] = {}
         self._to_recheck: deque[Key] = deque()
         self._for_pages: dict[Load, None] = {}  # loads that wait until the cells they read are known
         self._job_numbers, self.unfinished = 0, False
         self.prefetcher = Prefetcher(
-            cache, self.loads, pool, share=prefetch_share, outage_tolerance_s=outage_tolerance_s
+            cache, self.loads, pool, link, share=prefetch_share, outage_tolerance_s=outage_tolerance_s
         )
         self.room = Room(
             cache.ledger, cache.evictor, cache.reclaimer, cache.lost, self.loads, pool, self.prefetcher
@@ -186,12 +216,34 @@ class Scheduler:
         load.unless = failure.stamp
         return load
 
+    def want_spare(self, index: int, layer: str, now_s: float, asker: Hashable) -> Load | None:
+        """Load an absent cell for a spare request if that costs no client anything now; else return None.
+
+        A load that another request or a forecast has begun is returned, too.
+        """
+        cache, pool = self._cache, self.pool
+        key = cache.key(index, layer)
+        load = self.loads.by_key.get(key)
+        if load is not None and (load.running or not load.prefetch):
+            return load
+        estimate, failure = cache.estimate(index, layer), self.loads.failures.get(key)
+        if len(self.loads) or pool.free_places <= self.prefetcher.kept_places:
+            return None
+        if any(one.spare for one in self._jobs.values()) or self._ledger.shortage(estimate) > 0:
+            return None
+        if self.link is not None and not self.link.may_begin(now_s, ahead=True):
+            return None
+        if failure is not None and now_s < failure.retry_at_s:
+            return None
+        computed = self._layers.is_computed(index, layer)
+        return self.loads.spare(key, estimate, asker, computed=computed)
+
     def map_changed(self) -> None:
         """Handle another state of the map: loads of cells that left it are ended, some in each `pump`."""
         self._to_recheck = deque([*self.loads.by_key, *self.loads.failures])
         self.pages_finished()
         self.misplaced.map_changed()
-        self.pool.read_through(self._opened)
+        self.pool.read_through(opened_of(self._cache.catalogue))
 
     def pages_finished(self) -> None:
         """Start loads that waited for pages which have arrived, or request the pages still missing."""
@@ -219,14 +271,6 @@ class Scheduler:
             self.loads.defer(load)
             self._for_pages[load] = None
         return True
-
-    @property
-    def _opened(self) -> Opened:
-        """The directory through which files of the map are read."""
-        catalogue = self._cache.catalogue
-        if catalogue.opened is None:
-            return NOT_OPENED
-        return catalogue.opened.innermost(catalogue.id_prefix.rstrip("/"))
 
     def note_origin(self, *, unreachable: bool, back: bool) -> None:
         """Note whether the origin is unreachable; if it is ``back``, failed loads may be retried."""
@@ -259,6 +303,9 @@ class Scheduler:
             self.room.grant(self._jobs, now_s)
         self._drop_some()
         self.misplaced.check_some(LOOKS_PER_PUMP)
+        if self.link is not None:
+            self.link.update(now_s)
+        self._link_s = math.inf
         self.unfinished = len(self.loads) > 0 and self._hand_out_one(now_s)
 
     def _hand_out_one(self, now_s: float) -> bool:
@@ -284,10 +331,16 @@ class Scheduler:
             return True
         if load.estimate > estimate:
             return True  # the check was turned into a load that needs memory
+        if self._needed_bytes is not None:
+            load.link_bytes = self._needed_bytes(job) if isinstance(job, Job) else 0
+        if not self._may_fetch(load, now_s):
+            return False
         self.loads.start(load, now_s)
         self._job_numbers += 1
         try:
-            taken = self.pool.submit(job, now_s, prefetch=load.prefetch, opened=self._opened)
+            taken = self.pool.submit(
+                job, now_s, prefetch=load.prefetch, opened=opened_of(self._cache.catalogue)
+            )
         except Replaced:
             message = f"{job.source.name}: no loader can start: {RESTART}"
             self._fail(load, "load_failed", message, None, now_s)
@@ -303,6 +356,15 @@ class Scheduler:
         else:
             self.loads.requeue(load)
         return taken
+
+    def _may_fetch(self, load: Load, now_s: float) -> bool:
+        """Whether the link has room for a load; what is made from memory, and checks, need none."""
+        ahead = load.prefetch or load.spare
+        if self.link is None or not load.link_bytes or self.link.may_begin(now_s, ahead=ahead):
+            return True
+        # a wish waits for what is under way: whatever comes of that wakes the loop
+        self._link_s = self.link.rests_until_s if ahead else self.link.next_s()
+        return False
 
     def _job(self, load: Load, number: int) -> Job | Check | None:
         """Return a worker's job for a load; None if its cell left the map, or it is no longer wanted."""
@@ -320,63 +382,39 @@ class Scheduler:
                 return None
             load.estimate = cache.estimate(index, load.key.layer)
         layer = load.key.layer
-        ready = catalogue.ready(index, layer)
-        around = self._layers.neighbours(index, layer)
-        load.sources = tuple(map(catalogue.stamp, (index, *around)))
+        load.sources = tuple(map(catalogue.stamp, (index, *self._layers.neighbours(index, layer))))
         load.version = self._layers.version(index, layer)
-        warm = cache.warm
-        points = warm.get(index, LAYER) if layer != LAYER else None
-        return Job(
-            number,
-            load.key.cell_id,
-            catalogue.source(index),
-            layer,
-            catalogue.box(index),
-            catalogue.frame_id,
-            load.estimate,
-            points=points.name if points is not None else "",
-            neighbours=tuple(
-                Neighbour.of(catalogue.id(near), catalogue.source(near), catalogue.box(near))
-                for near in around
-            ),
-            ready=ready.version if ready is not None else 0,
-        )
+        return job_of(cache, number, index, layer, load.estimate)
 
     def next_event_s(self) -> float:
         """Return when there is something to do if nothing arrives; infinity for never."""
         if self._to_recheck or self.unfinished:
             return 0.0
-        return min(self._cache.next_reclaim_s(), self.pool.next_deadline_s())
+        return min(self._cache.next_reclaim_s(), self.pool.next_deadline_s(), self._link_s)
 
     # --- messages of workers -----------------------------------------------------------------------
 
     def on_worker(self, worker: Worker, now_s: float) -> None:
         """Handle one message of a worker."""
         try:
-            received = self.pool.receive(worker)
+            message = self.pool.next_message(worker, now_s)
         except EOFError as error:
             self.lost.ended(worker, str(error), now_s)
             return
-        if received is None:
-            return
-        message, fd = received
-        if isinstance(message, Ready) and fd >= 0:
-            self.pool.begun(worker, message.pid, fd, now_s)
-            return
-        if fd >= 0:
-            os.close(fd)
-        if isinstance(message, Ended):
-            self.lost.ended(worker, message.reason or how_ended(message.code), now_s)
-        elif isinstance(message, Ready):  # this process had no free descriptor to receive the pidfd
-            self.lost.ended(worker, "too many open files", now_s)
-        elif isinstance(message, Begun):
+        if isinstance(message, Begun):
             self.pool.works_on(worker, message.number, now_s)
+        elif isinstance(message, Arrived):
+            if self.link is not None:
+                self.link.arrived(message.bytes, now_s, message.delays_s)
+        elif isinstance(message, Fetched):
+            if self.link is not None and (load := self._jobs.get(message.number)) is not None:
+                self.link.end(load, message.bytes)
         elif isinstance(message, Compiling):
             worker.compiling = True
         elif isinstance(message, Need):
             self.room.ask(worker, message)
             self.room.grant(self._jobs, now_s)
-        else:
+        elif isinstance(message, Done | Checked | Failed):
             self._on_end(worker, message, now_s)
 
     def _on_end(self, worker: Worker, message: Done | Checked | Failed, now_s: float) -> None:
@@ -437,9 +475,10 @@ class Scheduler:
             box=catalogue.box(index),
             z_min=done.z_min,
             z_max=done.z_max,
-            last_use_s=now_s,
+            last_use_s=0.0 if load.spare else now_s,
             load_ns=done.load_ns,
             prefetched=load.prefetch,
+            spare=load.spare,
         )
         try:
             replaces = cache.publish(fd, done.header_bytes, resident, index, now_s)
@@ -500,6 +539,7 @@ class Scheduler:
         if code in SPACE_CODES:
             if load.prefetch:
                 self.prefetcher.full(now_s)
+            if load.prefetch or load.spare:
                 self._end(load)
                 return
             self._statistics.add("refused_over_budget")

@@ -17,6 +17,7 @@ import select
 import signal
 import socket
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, TypeAlias
@@ -25,10 +26,10 @@ from shmmap.compile_notices import watch
 from shmmap.daemon.host.scheduling import weigh_less
 from shmmap.daemon.loading import worker_messages
 from shmmap.daemon.records import failure_code
-from shmmap.errors import MapDataError, Offline, Replaced, SegmentCorrupt, ShmmapError
+from shmmap.errors import CannotWrite, MapDataError, Offline, Replaced, SegmentCorrupt, ShmmapError
 from shmmap.failpoints import step
 from shmmap.installed import RESTART
-from shmmap.layers.build import Made, make_layer
+from shmmap.layers.build import Made, cache_key, keep_layer, make_layer
 from shmmap.layers.disk_cache import LayerCache
 from shmmap.layers.points import LAYER
 from shmmap.layers.sources import FILES, CellJob, CellSource, Files, SourceReader, read_segment
@@ -42,9 +43,8 @@ from shmmap.segment.header import verify_file
 from shmmap.segment.pins import LOADER_SLOT, lock_slot
 from shmmap.segment.process_limits import limit_behind
 
-__all__ = ["WorkerSettings", "limit_memory", "work"]
-
 _NICENESS: Final = 10  # a warm request never waits for a load
+_LOWEST_NICENESS: Final = 19  # a load hardly waits for what is prepared
 _PAGE_BYTES: Final = 4096
 
 _Work: TypeAlias = tuple[worker_messages.Job, int]
@@ -91,6 +91,9 @@ class _Worker:
             self._light = self._light or weigh_less()
             if isinstance(job, worker_messages.Job):
                 self._load(job, fd)
+            elif isinstance(job, worker_messages.Prepare):
+                os.setpriority(os.PRIO_PROCESS, 0, _LOWEST_NICENESS)
+                self._prepare(job.job)
             elif isinstance(job, worker_messages.Check):
                 self._check(job)
             elif isinstance(job, worker_messages.Root) and isinstance(self.reader, Files):
@@ -164,7 +167,7 @@ class _Worker:
     def _load(self, job: worker_messages.Job, fd: int) -> None:
         """Fill the file of a job, and close it before the end of the job is reported."""
         started_ns = time.monotonic_ns()
-        try:
+        with self._reporting_failures(job):
             try:
                 _test_hook(job.source.name)
                 step("worker.alloc")
@@ -191,12 +194,33 @@ class _Worker:
             step("worker.pass")
             self._send(done)
             step("worker.passed")
+
+    def _prepare(self, job: worker_messages.Job) -> None:
+        """Compute a layer into the disk cache, unless it is there."""
+        with self._reporting_failures(job):
+            assert self.cache is not None  # noqa: S101  else nothing is prepared
+            _test_hook(job.source.name)
+            spec, cell = self._spec(job), self._cell(job)
+            key = cache_key(spec, cell)
+            kept = self.cache.size_of(key) if key is not None else 0
+            nbytes = kept or keep_layer(
+                spec, cell, self.cache, source=lambda: self._points_in_memory(job, spec)
+            )
+            self._send(worker_messages.Prepared(job.number, nbytes, computed=not kept))
+
+    @contextlib.contextmanager
+    def _reporting_failures(self, job: worker_messages.Job) -> Iterator[None]:
+        """Report whatever ends a job before its result is sent."""
+        try:
+            yield
         except _Refused:
             self._fail(job, "over_budget", "it does not fit in the budget")
         except Offline as error:
             self._fail(job, error.code, error.message, unread=True)
         except Replaced:
             self._fail(job, "load_failed", f"{job.source.name}: {RESTART}")
+        except CannotWrite as error:
+            self._fail(job, error.code, error.message)
         except ShmmapError as error:
             self._fail(job, "load_failed", str(error))
         except OSError as error:
@@ -227,14 +251,7 @@ class _Worker:
 
     def _make(self, job: worker_messages.Job, fd: int) -> Made:
         """Fill the segment."""
-        if len(job.neighbours) > MAX_NEIGHBOURS:
-            raise MapDataError(
-                f"{job.layer} looks into more than {MAX_NEIGHBOURS} cells around one",
-                path=job.source.name,
-                cause="unsupported_format",
-                hint="use a smaller radius, or larger cells",
-            )
-        spec = layer_spec(job.layer)
+        spec = self._spec(job)
         return make_layer(
             spec,
             self._cell(job),
@@ -244,6 +261,16 @@ class _Worker:
             source=lambda: self._points_in_memory(job, spec),
             reserve=lambda nbytes: self._reserve(job, nbytes),
         )
+
+    def _spec(self, job: worker_messages.Job) -> LayerSpec:
+        if len(job.neighbours) > MAX_NEIGHBOURS:
+            raise MapDataError(
+                f"{job.layer} looks into more than {MAX_NEIGHBOURS} cells around one",
+                path=job.source.name,
+                cause="unsupported_format",
+                hint="use a smaller radius, or larger cells",
+            )
+        return layer_spec(job.layer)
 
     def _cell(self, job: worker_messages.Job) -> CellJob:
         return CellJob(job.cell_id, job.source, job.box, job.frame_id, job.neighbours, self.reader, job.ready)
@@ -315,7 +342,12 @@ def work(channel: socket.socket, settings: WorkerSettings) -> int:
         from shmmap.origin.remote.opened_store import ServedFrom
 
         served = ServedFrom.from_words(*settings.origin)
-        reader = PublishedReader(served, settings.cache_dir, settings.cache_bytes)
+
+        def report(message: worker_messages.Arrived | worker_messages.Fetched) -> None:
+            with contextlib.suppress(OSError):  # the daemon has ended, or wants this process no more
+                channel.send(worker_messages.encode(message))
+
+        reader = PublishedReader(served, settings.cache_dir, settings.cache_bytes, report)
     worker = _Worker(channel, ShmDirectory(settings.shm_dir), cache, reader)
     watch(worker.note_compiling)
     with contextlib.suppress(BrokenPipeError, ConnectionResetError):

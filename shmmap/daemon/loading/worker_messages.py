@@ -15,26 +15,6 @@ import msgspec
 from shmmap.layers.sources import Neighbour
 from shmmap.segment.version import Source, Stamp
 
-__all__ = [
-    "Begun",
-    "Check",
-    "Checked",
-    "Compiling",
-    "Decision",
-    "Done",
-    "Ended",
-    "Failed",
-    "FromWorker",
-    "Job",
-    "Need",
-    "Ready",
-    "Root",
-    "ToWorker",
-    "decode_from_worker",
-    "decode_to_worker",
-    "encode",
-]
-
 
 class Job(msgspec.Struct, array_like=True, tag="job"):
     """Order to load one layer of one cell; ``granted`` bytes are reserved for it.
@@ -65,6 +45,22 @@ class Check(msgspec.Struct, array_like=True, tag="check"):
     stamp: Stamp
 
 
+class Prepare(msgspec.Struct, array_like=True, tag="prepare"):
+    """Order to compute a job's layer into the disk cache, unless it is there; no segment is made."""
+
+    job: Job
+
+    @property
+    def number(self) -> int:
+        """Number of the job."""
+        return self.job.number
+
+    @property
+    def source(self) -> Source:
+        """Source of the cell."""
+        return self.job.source
+
+
 class Root(msgspec.Struct, array_like=True, tag="root"):
     """Order to read files below the directory ``path`` through the descriptor sent with the packet."""
 
@@ -93,6 +89,20 @@ class Begun(msgspec.Struct, array_like=True, tag="begun"):
     """
 
     number: int
+
+
+class Arrived(msgspec.Struct, array_like=True, tag="arrived"):
+    """Report bytes that have come from the origin since the last report, and after how long answers began."""
+
+    bytes: int
+    delays_s: tuple[float, ...] = ()
+
+
+class Fetched(msgspec.Struct, array_like=True, tag="fetched"):
+    """Report that a job needs the origin no more; ``bytes`` have come from there for it."""
+
+    number: int
+    bytes: int
 
 
 class Compiling(msgspec.Struct, array_like=True, tag="compiling"):
@@ -133,6 +143,14 @@ class Done(msgspec.Struct, array_like=True, tag="done"):
     objects: tuple[int, ...] = ()
 
 
+class Prepared(msgspec.Struct, array_like=True, tag="prepared"):
+    """Report that a layer is in the disk cache: its bytes there, and whether it was computed just now."""
+
+    number: int
+    bytes: int
+    computed: bool
+
+
 class Checked(msgspec.Struct, array_like=True, tag="checked"):
     """Report that source and segment are valid, or why not (``wrong``); the worker has closed both.
 
@@ -168,8 +186,10 @@ class Ended(msgspec.Struct, array_like=True, tag="ended"):
     reason: str = ""
 
 
-ToWorker: TypeAlias = Job | Check | Root | Decision
-FromWorker: TypeAlias = Ready | Begun | Compiling | Need | Done | Checked | Failed | Ended
+ToWorker: TypeAlias = Job | Check | Prepare | Root | Decision
+FromWorker: TypeAlias = (
+    Ready | Begun | Arrived | Fetched | Compiling | Need | Done | Prepared | Checked | Failed | Ended
+)
 
 encode: Final = msgspec.msgpack.Encoder().encode
 decode_to_worker: Final = msgspec.msgpack.Decoder[ToWorker](ToWorker).decode

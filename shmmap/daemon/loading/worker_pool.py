@@ -26,12 +26,10 @@ from shmmap.daemon.turns import WatchedDescriptors
 from shmmap.errors import Replaced
 from shmmap.layers.points import LAYER
 from shmmap.logfmt import log
-from shmmap.processes.start_child import channel, packet_buffer, receive_packet
+from shmmap.processes.start_child import channel, how_ended, packet_buffer, receive_packet
 from shmmap.segment.directory import ShmDirectory
 
-__all__ = ["NOT_OPENED", "Opened", "Work", "Worker", "WorkerPool"]
-
-Work = worker_messages.Job | worker_messages.Check
+Work = worker_messages.Job | worker_messages.Check | worker_messages.Prepare
 Opened: TypeAlias = tuple[str, int]
 """Directory through which files are read: its path, and its descriptor."""
 NOT_OPENED: Final = ("", -1)
@@ -55,7 +53,7 @@ def _has_ended(pidfd: int) -> bool:
 
 
 def is_computed(job: Work) -> bool:
-    """Whether a job may take long; a check of a file or a segment does not."""
+    """Whether a load may take long; a check of a file or a segment does not."""
     return isinstance(job, worker_messages.Job) and job.layer != LAYER and not job.ready
 
 
@@ -177,6 +175,11 @@ class WorkerPool:
         return found or self._may_start or (not computed and self._may_start_one_for_points)
 
     @property
+    def is_ending(self) -> bool:
+        """Whether workers that were killed have not exited yet: they keep their places."""
+        return bool(self._ending)
+
+    @property
     def compiling(self) -> int:
         """Number of workers that compile kernels now."""
         return sum(worker.compiling for worker in self._workers.values())
@@ -266,7 +269,7 @@ class WorkerPool:
                     return False
         if worker.ready and _has_ended(worker.pidfd):
             return False  # its end is about to be reported: the job would be taken for the cause
-        fd = -1 if isinstance(job, worker_messages.Check) else self.directory.create()
+        fd = self.directory.create() if isinstance(job, worker_messages.Job) else -1
         try:
             self._send_root(worker, opened)
             self._send(worker, job, fd)
@@ -338,6 +341,29 @@ class WorkerPool:
             if fd >= 0:
                 os.close(fd)
             raise EOFError("its message could not be read") from error
+
+    def next_message(self, worker: Worker, now_s: float) -> worker_messages.FromWorker | None:
+        """Return a worker's next message about its jobs; None if there is none now.
+
+        Raises
+        ------
+        EOFError
+            The worker has ended, or cannot be used; says why, if that is known.
+        """
+        received = self.receive(worker)
+        if received is None:
+            return None
+        message, fd = received
+        if isinstance(message, worker_messages.Ready) and fd >= 0:
+            self.begun(worker, message.pid, fd, now_s)
+            return None
+        if fd >= 0:
+            os.close(fd)
+        if isinstance(message, worker_messages.Ended):
+            raise EOFError(message.reason or how_ended(message.code))
+        if isinstance(message, worker_messages.Ready):  # this process had no free descriptor for the pidfd
+            raise EOFError("too many open files")
+        return message
 
     def begun(self, worker: Worker, pid: int, pidfd: int, now_s: float) -> None:
         """Note that a worker is ready; the pool now owns its pidfd."""
@@ -424,10 +450,14 @@ class WorkerPool:
         due_s = (min(self._due_s(w), self._stalled_s(w)) for w in self._workers.values() if w.queue)
         return min(due_s, default=math.inf)
 
-    def close(self) -> None:
-        """End every worker, and the parent process."""
+    def end_workers(self) -> None:
+        """End every worker."""
         for worker in self:
             self.remove(worker)
-        self.parent.close()
         for pidfd in list(self._ending):
             self._reap(pidfd)
+
+    def close(self) -> None:
+        """End every worker, and the parent process."""
+        self.end_workers()
+        self.parent.close()

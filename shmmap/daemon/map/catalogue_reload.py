@@ -20,8 +20,6 @@ from shmmap.errors import InternalError, ShmmapError
 from shmmap.logfmt import log
 from shmmap.origin.catalogue import CatalogueChange
 
-__all__ = ["Reloader", "Reread"]
-
 
 @dataclass(frozen=True, slots=True)
 class Reread:

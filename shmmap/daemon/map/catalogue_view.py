@@ -37,8 +37,6 @@ from shmmap.origin.map_layout import OpenedDirectories
 from shmmap.origin.map_report import MapFrame
 from shmmap.segment.version import Source, Stamp
 
-__all__ = ["CatalogueView", "PageNews", "Pages", "Ready", "ViewOrigin"]
-
 
 class Ready(NamedTuple):
     """A layer that the origin has ready-made: its bytes in memory, and its version."""
@@ -103,6 +101,9 @@ class Pages(Protocol):
         `shmmap.daemon.loading.loads.PREFETCH` plus seconds.  A page that is already wanted only moves
         forward; a page in memory counts as just needed.
         """
+
+    def want_nearest(self, place: tuple[float, float] | None) -> bool:
+        """Fetch the missing page that is nearest to a place; return whether one is begun."""
 
     def collect(self) -> PageNews:
         """Merge pages that have arrived since the last call."""

@@ -31,9 +31,7 @@ from shmmap.daemon.host.inotify import (
 )
 from shmmap.errors import CannotStart
 from shmmap.logfmt import log
-from shmmap.mounts import mount_of
-
-__all__ = ["FileWatch", "directories_of"]
+from shmmap.mounts import REMOTE, mount_of
 
 SETTLE_S: Final = 0.5
 MAX_DELAY_S: Final = 5.0
@@ -41,20 +39,6 @@ MAX_LINKS: Final = 40
 """Number of links that the kernel follows."""
 LOOK_S: Final = 1.0
 """Interval of checking whether a vanished directory exists again."""
-
-_REMOTE: Final = (
-    "nfs",
-    "nfs4",
-    "cifs",
-    "smb3",
-    "9p",
-    "ceph",
-    "lustre",
-    "glusterfs",
-    "afs",
-    "fuse.sshfs",
-    "fuse.glusterfs",
-)
 
 
 def directories_of(map_path: str, metadata: str, id_prefix: str) -> set[str]:
@@ -130,7 +114,7 @@ class FileWatch:
             if refused is not None and refused.errno not in (errno.ENOENT, errno.ENOTDIR):
                 self.close()
                 raise _refusal(refused)
-            if (mount := mount_of(directory)).kind in _REMOTE:
+            if (mount := mount_of(directory)).kind in REMOTE:
                 log.warning(
                     "changes made on other machines are not noticed",
                     directory=directory,

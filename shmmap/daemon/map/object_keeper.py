@@ -19,8 +19,7 @@ from shmmap.errors import Offline, ShmmapError
 from shmmap.logfmt import log
 from shmmap.origin.remote.object_tier import KeptObjects, ObjectCounts, ObjectTier
 from shmmap.origin.remote.published_object import ObjectName
-
-__all__ = ["Kept", "KeptCell", "ObjectKeeper"]
+from shmmap.origin.remote.transport import reporting_bytes
 
 THREADS: Final = 8
 END_S: Final = 0.2
@@ -44,11 +43,14 @@ class Kept(NamedTuple):
         The objects are on the disk.
     has_no_room
         The objects were fetched, but the disk has no room for them.
+    received
+        Bytes that came from the store.
     """
 
     key: KeptCell
     is_here: bool
     has_no_room: bool = False
+    received: int = 0
 
 
 class ObjectKeeper:
@@ -58,6 +60,8 @@ class ObjectKeeper:
     ----------
     failed
         Called, in a thread, when the store could not be reached.
+    arrived
+        Called, in a thread, with the number of bytes of each piece that comes from the store.
 
     Attributes
     ----------
@@ -65,9 +69,15 @@ class ObjectKeeper:
         Readable when `take` has results.
     """
 
-    def __init__(self, objects: KeptObjects, tier: ObjectTier, failed: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        objects: KeptObjects,
+        tier: ObjectTier,
+        failed: Callable[[], None],
+        arrived: Callable[[int], None] = lambda _nbytes: None,
+    ) -> None:
         self.fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
-        self._objects, self._tier, self._failed = objects, tier, failed
+        self._objects, self._tier, self._failed, self._arrived = objects, tier, failed, arrived
         self._wanted: queue.SimpleQueue[tuple[KeptCell, Sequence[ObjectName]] | None] = queue.SimpleQueue()
         self._done: deque[Kept] = deque()
         self._threads: list[threading.Thread] = []
@@ -106,7 +116,16 @@ class ObjectKeeper:
 
     def _run(self) -> None:
         while (wanted := self._wanted.get()) is not None:
-            self._finish(self._keep(*wanted))
+            received = 0
+
+            def arrived(nbytes: int) -> None:
+                nonlocal received
+                received += nbytes
+                self._arrived(nbytes)
+
+            with reporting_bytes(arrived):
+                kept = self._keep(*wanted)
+            self._finish(kept._replace(received=received))
 
     def _finish(self, kept: Kept) -> None:
         self._done.append(kept)

@@ -15,8 +15,6 @@ from typing import Final, NamedTuple
 from shmmap.errors import Offline, ShmmapError
 from shmmap.logfmt import log
 
-__all__ = ["LinkNews", "OriginLink"]
-
 PROBE_S: Final = 1.0
 """Interval of polling an origin that is unreachable."""
 JITTER: Final = 0.2

@@ -12,6 +12,7 @@ from typing import Final, NamedTuple
 
 import msgspec
 
+from shmmap.daemon.map.arrivals import Arrivals
 from shmmap.daemon.map.object_keeper import ObjectKeeper
 from shmmap.daemon.map.origin_link import OriginLink
 from shmmap.daemon.map.published_view import PublishedView
@@ -45,8 +46,6 @@ from shmmap.origin.remote.taken_version import TakenVersion, TakenVersionFile, j
 from shmmap.origin.remote.verify_apart import Verified, VerifySettings, read_trusted_root, verify_apart
 from shmmap.processes.request_threads import RequestThreads
 from shmmap.statistics.counters import REFUSALS
-
-__all__ = ["PublishedOrigin"]
 
 NOTHING: Final = CurrentState(None, None)
 VERIFY_S: Final = 30.0
@@ -98,6 +97,8 @@ class PublishedOrigin:
         Where loaders fetch objects.
     link
         Reports whether the origin is reachable, and whether it has another version.
+    arrivals
+        Bytes of pages, and of objects kept on the disk, that have come from the origin.
     keeper
         Keeps objects of cells on the disk ahead of use; None without a disk cache.
     """
@@ -143,11 +144,17 @@ class PublishedOrigin:
         self._saved: TakenVersion | None = None
         self._in_service: TakenVersion | None = None
         self.link = OriginLink(self._has_another, poll_s)
-        self._fetcher = ShardFetcher(self._index, self.link.doubt)
+        self.arrivals = Arrivals()
+        self._fetcher = ShardFetcher(self._index, self.link.doubt, self.arrivals)
         self._pages: weakref.WeakSet[ShardPages] = weakref.WeakSet()
         self.keeper: ObjectKeeper | None = None
         if self._tier is not None:
-            self.keeper = ObjectKeeper(KeptObjects(self._store, self._tier), self._tier, self.link.doubt)
+            self.keeper = ObjectKeeper(
+                KeptObjects(self._store, self._tier),
+                self._tier,
+                self.link.doubt,
+                self.arrivals.add_ahead,
+            )
 
     # --- taking a version -------------------------------------------------------------------------
 

@@ -22,8 +22,6 @@ from shmmap.origin.remote.published_object import POINTS, LayerSource, pack_sour
 from shmmap.origin.spatial_index import touches
 from shmmap.segment.version import Source, Stamp
 
-__all__ = ["PublishedView"]
-
 Indices: TypeAlias = NDArray[np.intp]
 _Pair: TypeAlias = tuple[int | None, int | None]
 """Numbers of the shards that cover one place in an earlier version and in a later one."""

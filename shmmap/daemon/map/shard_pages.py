@@ -11,13 +11,14 @@ import threading
 import time
 import weakref
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from shmmap.daemon.map.arrivals import Arrivals
 from shmmap.daemon.map.catalogue_view import PageNews, Pages
 from shmmap.errors import BadRequest, MapDataError, Offline, ShmmapError
 from shmmap.geometry import Area, distance_to_boxes
@@ -26,11 +27,12 @@ from shmmap.logfmt import log
 from shmmap.origin.remote.map_versions import read_shard_object
 from shmmap.origin.remote.published_index import Root, Shard, unpack_shard
 from shmmap.origin.remote.store import ObjectReader
+from shmmap.origin.remote.transport import reporting_bytes
 from shmmap.origin.remote.zstd_frame import DAMAGED
 
-__all__ = ["FEW_SHARDS", "THREADS", "Page", "ShardFetcher", "ShardPages"]
-
 THREADS: Final = 8
+BACKGROUND_FETCHES: Final = 2
+"""Limit of concurrent fetches of pages that nothing needs yet."""
 END_S: Final = 0.2
 """How long a daemon that stops waits for a thread that waits for the origin."""
 FEW_SHARDS: Final = 16
@@ -39,9 +41,6 @@ NAME_BYTES: Final = 150
 """Memory of a cell's name with its entry in the table of names."""
 NAME_TABLES: Final = 64
 """Names are distributed over many dicts: a single one would stop the loop whenever it grows."""
-BACKGROUND_FETCHES: Final = 2
-"""Limit of concurrent fetches of pages that nothing needs yet, so that needed pages get most of the link.
-With 8 at a time over 20 Mbit/s and 50 ms, needed pages took twice as long."""
 BACKGROUND: Final = 1e15
 """Priority of pages that nothing needs yet: after all needed ones."""
 NAMED: Final = 3
@@ -102,10 +101,12 @@ class ShardFetcher:
     ----------
     failed
         Called, in a thread, when a fetch has failed.
+    arrivals
+        Counts what is being fetched and what has come.
     """
 
-    def __init__(self, objects: ObjectReader, failed: Callable[[], None]) -> None:
-        self._objects = objects
+    def __init__(self, objects: ObjectReader, failed: Callable[[], None], arrivals: Arrivals) -> None:
+        self._objects, self._arrivals = objects, arrivals
         self._failed = failed
         self._condition = threading.Condition()
         self._wanted: list[tuple[float, int, weakref.ref[ShardPages], int]] = []
@@ -162,15 +163,20 @@ class ShardFetcher:
             return None if self._closed else heapq.heappop(self._wanted)[2:]
 
     def _fetch(self, root: Root, number: int) -> Shard | None:
-        name = f"shard {root.keys[number].tolist()}"
+        name, nbytes = f"shard {root.keys[number].tolist()}", int(root.sizes[number])
+        self._arrivals.add_pages(nbytes)
         try:
-            return unpack_shard(read_shard_object(self._objects, root, number), root, number)
+            with reporting_bytes(self._arrivals.add_index):
+                frame = read_shard_object(self._objects, root, number)
+            return unpack_shard(frame, root, number)
         except Offline:
             pass  # `OriginLink` reports it, once
         except ShmmapError as error:
             log.error("part of the list of cells cannot be used", part=name, reason=error)
         except BaseException:  # noqa: BLE001  also panics: else the shard would never be fetched again
             log.exception("part of the list of cells cannot be used", part=name, cause="a defect in shmmap")
+        finally:
+            self._arrivals.add_pages(-nbytes)
         return None
 
     def close(self) -> bool:
@@ -216,16 +222,15 @@ class ShardPages:
         self._by_name: list[dict[bytes, int]] = [{} for _ in range(NAME_TABLES)]
         self._by_base: ShardedDict[bytes, tuple[int, ...]] = ShardedDict()
         self._arrived: deque[tuple[int, Page | None, list[dict[bytes, int]]]] = deque()
-        self._nearest: Iterator[int] | None = None
         self.known_cells = 0
         low = root.keys[:, ::-1] * root.shard_m
         self._boxes = np.hstack([low, low + root.shard_m + np.array(root.largest_m)])
-        self._around: tuple[float, float] = (
+        self._middle = (
             0.5 * (root.bounds[0] + root.bounds[2]),
             0.5 * (root.bounds[1] + root.bounds[3]),
         )
+        self._absent = np.ones(len(root.keys), bool)
         self._news = _News()
-        self._news.notify()  # the first `collect` requests pages that nothing needs
         for number, shard in known.items():
             page = self._page(number, shard)
             names = _shared_out(page)
@@ -338,20 +343,15 @@ class ShardPages:
     # --- coming and going -------------------------------------------------------------------------
 
     def want(self, pages: Iterable[int], priority: float) -> None:
-        """Fetch pages, those with the lowest priority first."""
-        absent = []
+        """Fetch those of some pages that are missing, the ones with the lowest priority first."""
         for number in pages:
             page = self._here.pop(number, None)
             if page is not None:
                 self._here[number] = page
                 continue
-            absent.append(number)
             if number not in self._lost and priority < self._wanted.get(number, np.inf):
                 self._wanted[number] = priority
                 self._fetcher.want(self, number, priority)
-        if absent:
-            x, y = self._boxes[absent, :2].mean(axis=0).tolist()
-            self._around, self._nearest = (x, y), None
 
     def deliver(self, number: int, shard: Shard | None) -> None:
         """Queue an arrived shard; None: it cannot be fetched at present.  Called in a thread."""
@@ -386,7 +386,6 @@ class ShardPages:
                 come.append(number)
         if self._arrived:
             self._news.notify()
-        self._fill()
         return PageNews(come, lost)
 
     def try_again(self) -> None:
@@ -416,6 +415,7 @@ class ShardPages:
     def drop(self, page: int) -> None:
         """Forget a page's cells."""
         dropped = self._here.pop(page)
+        self._absent[page] = True
         self._bytes -= dropped.nbytes
         self.known_cells -= len(dropped.shard)
         for index, name in enumerate(dropped.shard.names, dropped.first):
@@ -440,6 +440,7 @@ class ShardPages:
 
     def _take(self, page: Page, names: list[dict[bytes, int]]) -> None:
         self._here[page.number] = page
+        self._absent[page.number] = False
         self._bytes += page.nbytes
         self.known_cells += len(page.shard)
         for table, some in zip(self._by_name, names, strict=True):
@@ -450,29 +451,26 @@ class ShardPages:
                     base = name.rpartition(b"/")[2]
                     self._by_base[base] = (*self._by_base.get(base, ()), index)
 
-    def _fill(self) -> None:
-        """Fetch some pages that nothing needs yet, the nearest first, while there is memory.
+    def want_nearest(self, place: tuple[float, float] | None) -> bool:
+        """Fetch the missing page that is nearest to a place, or to the map's middle.
 
-        No page is fetched this way while needed ones are missing.
+        Returns whether one is begun: none is while others are needed, while some are out of reach, or if
+        memory has no room for it.
         """
         is_needed = any(priority < BACKGROUND for priority in self._wanted.values())
         if self._lost or is_needed or len(self._wanted) >= BACKGROUND_FETCHES or self.complete:
-            return
+            return False
+        absent = self._absent.copy()
+        absent[list(self._wanted)] = False
+        numbers = np.flatnonzero(absent)
+        if not len(numbers):
+            return False
+        x, y = place or self._middle
+        number = int(numbers[np.argmin(distance_to_boxes(x, y, self._boxes[numbers]))])
         counts = self.root.counts
         cell_bytes = self._bytes / self.known_cells if self.known_cells else 2.0 * NAME_BYTES
-        room = self._max_bytes - self._bytes if len(self) > FEW_SHARDS else np.inf
-        room -= cell_bytes * sum(int(counts[number]) for number in self._wanted)
-        if self._nearest is None:
-            order = np.argsort(distance_to_boxes(*self._around, self._boxes), kind="stable")
-            self._nearest = iter(order.tolist())
-        for number in self._nearest:
-            if number in self._here or number in self._wanted:
-                continue
-            room -= cell_bytes * int(counts[number])
-            if room < 0:
-                self._nearest = iter((number,))  # no memory is left, until an area needs other pages
-                return
-            self._wanted[number] = BACKGROUND
-            self._fetcher.want(self, number, BACKGROUND)
-            if len(self._wanted) >= BACKGROUND_FETCHES:
-                return
+        more = cell_bytes * sum(int(counts[one]) for one in (number, *self._wanted))
+        if len(self) > FEW_SHARDS and self._bytes + more > self._max_bytes:
+            return False
+        self.want((number,), BACKGROUND)
+        return True

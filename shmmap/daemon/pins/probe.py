@@ -20,8 +20,6 @@ from shmmap.daemon.host.inotify import CLOSED, Inotify
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import holders, in_use, lock_slot
 
-__all__ = ["PinSource", "PinSupport", "probe_pins"]
-
 _SLOT: Final = 12345
 
 

@@ -19,8 +19,6 @@ from shmmap.daemon.pins.probe import PinSource
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import holders, in_use
 
-__all__ = ["PinWatch"]
-
 KEPT_OPEN: Final = 1024
 """Limit of retired segments that are kept open; others are queried periodically."""
 KEPT_SHARE: Final = 8

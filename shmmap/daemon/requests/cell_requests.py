@@ -20,7 +20,7 @@ import msgspec
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.map.catalogue_view import PageNews
-from shmmap.daemon.records import SPACE_CODES, Resident
+from shmmap.daemon.records import SPACE_CODES, Load, Resident
 from shmmap.daemon.requests import limits
 from shmmap.daemon.requests.differential import difference, warm_difference
 from shmmap.daemon.requests.pending_request import LARGE, Found, MapChanged, PendingRequest, WaitingList
@@ -32,8 +32,6 @@ from shmmap.geometry import Area
 from shmmap.protocol import messages
 from shmmap.protocol.codec import PackedArray, encode_cells
 from shmmap.protocol.messages import FailedCell, Holder, PendingCell
-
-__all__ = ["CellRequests"]
 
 MAX_WAIT_S: Final = 3600.0
 MAX_COMPARED: Final = 4096
@@ -155,6 +153,7 @@ class CellRequests:
             found.covered = not found.unknown or self._cache.catalogue.complete
 
         wanted = self._pending(session, message, find, None, len(message.ids))
+        wanted.spare = message.spare
         return self._serve(wanted, message.wait)
 
     def differential(self, session: Session, message: messages.Differential) -> Iterator[None]:
@@ -300,13 +299,14 @@ class CellRequests:
                 if resident is None:
                     cold.append(cell)
                 sizes.append(cache.estimate(index, layer) if resident is None else resident.nbytes)
-        if not wanted.began_s:
+        counts = not wanted.began_s and not wanted.spare
+        if counts:
             self._statistics.add("hits", len(found.cells) - len(cold))
         yield from wanted.pause(now=wanted.is_large)
         yield from self._quota.check(wanted, sizes)
         if cold:
             yield from limits.check_queue(self._scheduler.loads, wanted, cold)
-            self._statistics.add("misses", len(cold) * (not wanted.began_s))
+            self._statistics.add("misses", len(cold) * counts)
             yield from self._load(wanted, cold, note=note)
         found.requested = True
 
@@ -319,12 +319,19 @@ class CellRequests:
                 key = self._cache.key(index, layer)
                 if key in wanted.found.refused or warm.get(index, layer) is not None:
                     continue  # another client may have had it loaded in the meantime
-                prefetcher.note_cold(wanted.session, key)
-                if self._scheduler.want(index, layer, distance, now_s, wanted.session.asker) and note:
+                load: Load | None
+                if wanted.spare:
+                    load = self._scheduler.want_spare(index, layer, now_s, wanted.session.asker)
+                else:
+                    prefetcher.note_cold(wanted.session, key)
+                    load = self._scheduler.want(index, layer, distance, now_s, wanted.session.asker)
+                if load and note:
                     self._waiting.wait_for(wanted, key)
 
     def _need(self, wanted: PendingRequest) -> Iterator[None]:
-        """Protect all requested cells from eviction until the answer has left."""
+        """Protect all requested cells from eviction until the answer has left, except spare ones."""
+        if wanted.spare:
+            return
         for cells in batched(wanted.found.cells):
             yield from wanted.pause()
             for index, layer in cells:
@@ -406,7 +413,8 @@ class CellRequests:
                 resident = warm[layer].get(index) if layer in warm else None
                 resident = resident or cache.find_warm(index, layer, now_s)
                 if resident is not None and not found.refused:
-                    resident.last_use_s = now_s  # the other bookkeeping follows when the answer has left
+                    if not wanted.spare:
+                        resident.last_use_s = now_s  # the other bookkeeping follows when the answer has left
                     answer.residents.append(resident)
                     answer.handles.append(resident.handle)
                 elif resident is not None or not (may_wait and self._waits_for(wanted, index, layer, now_s)):
@@ -419,7 +427,7 @@ class CellRequests:
         self._reply(wanted.session, wanted.request, wanted.layers, answer, found, failed)
         if wanted.began_s:
             self._statistics.add_duration("wait", int((now_s - wanted.began_s) * 1e9))
-        yield from self._hand_out(wanted.session, answer, wanted.pace)
+        yield from self._hand_out(wanted.session, answer, wanted.pace, spare=wanted.spare)
         while found.cells:  # freeing very many takes time, too
             del found.cells[-NOTED_PER_STEP:]
             yield from wanted.pace.pause()
@@ -430,7 +438,7 @@ class CellRequests:
         key, loads = self._cache.key(index, layer), self._scheduler.loads
         if key in wanted.outstanding:
             return True
-        if key in wanted.found.refused or key in loads.failures:
+        if wanted.spare or key in wanted.found.refused or key in loads.failures:
             return False
         if not self._scheduler.want(index, layer, 0.0, now_s, wanted.session.asker):
             return False
@@ -460,7 +468,7 @@ class CellRequests:
             box = catalogue.box(index)
             answer.failed.append(FailedCell(wire_id, layer, failure.code, failure.message, holders, box))
         elif not current:
-            if not promised:  # evicted, or no longer out of room: "pending" promises a load
+            if not promised and not wanted.spare:  # evicted, or no longer out of room: a load is promised
                 self._scheduler.want(index, layer, PROMISED, now_s, wanted.session.asker)
             answer.pending.append(PendingCell(wire_id, layer))
 
@@ -501,13 +509,16 @@ class CellRequests:
         )  # fmt: skip
         session.connection.reply(reply)
 
-    def _hand_out(self, session: Session, answer: _Answer, pace: Pace) -> Iterator[None]:
+    def _hand_out(
+        self, session: Session, answer: _Answer, pace: Pace, *, spare: bool = False
+    ) -> Iterator[None]:
         """Note what a session was given; the first cells at once, before the client can have left."""
         residents = answer.residents
         self._statistics.add("handles_sent", len(residents))
         for begin in range(0, len(residents), NOTED_PER_STEP):
             some = residents[begin : begin + NOTED_PER_STEP]
-            self._cache.hand_out(some, self._now_s())
+            if not spare:
+                self._cache.hand_out(some, self._now_s())
             session.hold(some)
             yield from pace.pause()
             if not session.is_connected:
@@ -558,8 +569,17 @@ class CellRequests:
     def on_disconnect(self, session: Session) -> None:
         """Drop the requests of a session whose connection has ended."""
         for wanted in self._waiting.of(session):
-            self._waiting.remove(wanted)
-            self._end(wanted)
+            self._drop(wanted)
+
+    def cancel(self, session: Session, request: int) -> None:
+        """Drop a waiting request of a session, by its id, without an answer."""
+        for wanted in self._waiting.of(session):
+            if wanted.request == request:
+                self._drop(wanted)
+
+    def _drop(self, wanted: PendingRequest) -> None:
+        self._waiting.remove(wanted)
+        self._end(wanted)
 
     def on_session_end(self, session: Session) -> None:
         """Release the segments of a session that has ended."""

@@ -23,8 +23,6 @@ from shmmap.layers.spec import canonical_layers
 from shmmap.protocol.codec import check_packed, pack_versions, unpack_versions
 from shmmap.protocol.messages import Differential, HeldCell
 
-__all__ = ["WarmDifference", "difference", "warm_difference"]
-
 
 @dataclass(eq=False, slots=True)
 class WarmDifference:

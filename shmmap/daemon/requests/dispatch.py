@@ -36,8 +36,6 @@ from shmmap.protocol.codec import decode_request, encode, request_number, unpack
 from shmmap.protocol.live import LIVE_REQUESTS
 from shmmap.statistics.writer import StatisticsWriter
 
-__all__ = ["Defects", "Dispatch"]
-
 MAX_DEFECTS: Final = 100
 WITHIN_S: Final = 10.0
 """`MAX_DEFECTS` exceptions from one line of code within this time are fatal; one of them is logged."""
@@ -145,6 +143,8 @@ class Dispatch:
             self.live.ask(session, message, body, now_s)
         elif isinstance(message, messages.Metadata):
             self.queries.metadata(session, message, now_s)
+        elif isinstance(message, messages.Cancel):
+            self.cells.cancel(session, message.request)
         elif isinstance(message, messages.Bye):
             self.handshake.leave(session)
         elif isinstance(message, messages.Stats):

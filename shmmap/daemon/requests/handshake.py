@@ -22,8 +22,6 @@ from shmmap.protocol import events
 from shmmap.protocol.messages import PROTOCOL_VERSION, Hello
 from shmmap.statistics.writer import StatisticsWriter
 
-__all__ = ["Handshake"]
-
 LOOKED_AT: Final = 64
 """Departed sessions checked per beat."""
 

@@ -24,17 +24,6 @@ from shmmap.layers.spec import canonical_layer, canonical_layers
 from shmmap.protocol import messages
 from shmmap.quantities import format_bytes
 
-__all__ = [
-    "MAX_CELLS",
-    "SessionQuota",
-    "check_count",
-    "check_held",
-    "check_intent",
-    "check_queue",
-    "layers_named",
-    "layers_of",
-]
-
 MAX_CELLS: Final = 20_000
 """Cells of one request, over all its layers."""
 MAX_QUEUED: Final = 20_000

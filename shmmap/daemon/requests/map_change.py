@@ -19,8 +19,6 @@ from shmmap.logfmt import log
 from shmmap.origin.catalogue import CatalogueChange
 from shmmap.protocol import events
 
-__all__ = ["MapChange"]
-
 MAX_NAMED: Final = 64
 """Changed cells with an event each: a rewritten map has a million; `metadata` lists them all."""
 MAX_PROBLEMS: Final = 64

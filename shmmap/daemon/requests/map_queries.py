@@ -37,10 +37,10 @@ from shmmap.protocol.events import Recent
 from shmmap.protocol.rows import CellState
 from shmmap.version import build_version
 
-__all__ = ["MapQueries"]
-
 PAGE_ROWS: Final = 500
 """Rows of a metadata page, at most: a full one takes the serving loop about a millisecond."""
+SEGMENTS_PER_PAGE: Final = 64
+"""Segments in a page of the list of those in memory: half a millisecond of the serving loop."""
 LOOKED_AT: Final = 20_000
 """Cells tested for one page of an area's metadata; retired segments examined for one cell."""
 METADATA_WAIT_S: Final = 0.25
@@ -111,6 +111,8 @@ class MapQueries:
         """Return the answer to a query."""
         if isinstance(message, Recent):
             return self.event_log.page(message)
+        if isinstance(message, messages.ListCells):
+            return self._cells_page(message)
         if isinstance(message, messages.Show):
             return self._show(message)
         raise BadRequest(f"a {type(message).__name__} cannot be answered here")
@@ -335,13 +337,26 @@ class MapQueries:
             z_min=z_min, z_max=z_max, pinned=self.pins.layers_of(cell_id),
         )  # fmt: skip
 
+    def _cells_page(self, message: messages.ListCells) -> messages.CellsPage:
+        found, following = self.cache.ledger.segments.page(message.start, SEGMENTS_PER_PAGE)
+        rows = tuple(map(self._row_of_segment, found))
+        return messages.CellsPage(message.request, self.cache.epoch, rows, following)
+
     def _segment(self, resident: Resident) -> messages.CellRow:
-        holders, ledger = self.cache.holders, self.cache.ledger
-        state: CellState = "resident" if self.cache.is_current(resident) else "stale"
-        if resident.name in ledger.retired:
+        row, holders = self._row_of_segment(resident), self.cache.holders.of(resident)
+        return replace(row, id=resident.key.cell_id, segment=resident.name, holders=holders)
+
+    def _row_of_segment(self, resident: Resident) -> messages.CellRow:
+        cache = self.cache
+        state: CellState = "resident" if cache.is_current(resident) else "stale"
+        if resident.name in cache.ledger.retired:
             state = "zombie"
-        row = self.cache.events.row(resident, state)
-        return replace(row, id=resident.key.cell_id, segment=resident.name, holders=holders.of(resident))
+        return messages.CellRow(
+            cache.wire_id(resident.key.cell_id), resident.key.layer, resident.version,
+            resident.name.removeprefix(cache.segment_prefix), state, resident.nbytes, resident.points,
+            resident.box, resident.hits, int(resident.last_use_s * 1e9), resident.load_ns,
+            ahead=resident.prefetched and state == "resident",
+        )  # fmt: skip
 
 
 def _with_share(row: messages.ClientRow, share: Share) -> messages.ClientRow:

@@ -14,14 +14,14 @@ from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.loading.adoption import Adoption
 from shmmap.daemon.loading.loads import BACKGROUND
 from shmmap.daemon.loading.scheduler import Scheduler
-from shmmap.daemon.map.catalogue_view import CatalogueView
+from shmmap.daemon.map.catalogue_view import CatalogueView, Pages
 from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.daemon.requests.map_queries import MapQueries
 from shmmap.daemon.transport.sessions import Sessions
 from shmmap.daemon.turns import WatchedDescriptors
 
-__all__ = ["Paging"]
-
+FILL_S: Final = 0.25
+"""Interval of looking whether the link is idle while pages are missing, seconds."""
 KEPT_S: Final = 0.02
 """Pause after a page that has to stay: one check takes about a millisecond."""
 MAX_RETIRED: Final = 20_000
@@ -31,6 +31,8 @@ MAX_RETIRED: Final = 20_000
 @dataclass(eq=False, slots=True)
 class Paging:
     """Reports pages that have arrived, or cannot be fetched, and drops pages that nothing needs.
+
+    While the link is idle and a client is connected, pages that nothing needs yet are fetched, too.
 
     A page is needed while one of its cells has a segment, a load or a pin, or while an unanswered request or
     a session's area may have cells in it.  This class is a background task of the serving loop.
@@ -48,6 +50,8 @@ class Paging:
     _coming_fd: int = -1
     _was_out_of_reach: bool = False
     _rests_until_s: float = -math.inf
+    _fill_s: float = -math.inf
+    _turn: int = 0
 
     def follow(self) -> None:
         """Switch to the pages of the map that is served from now on."""
@@ -94,6 +98,7 @@ class Paging:
         news = pages.collect()
         if news.come and self._was_out_of_reach:  # loads that failed for lack of a page may succeed now
             self.scheduler.loads.forget_failures()
+        self._fill_s = -math.inf
         self._was_out_of_reach = bool(news.out_of_reach) or (self._was_out_of_reach and not news.come)
         if news.come:
             self.adoption.pages_came(news.come, time.monotonic())
@@ -112,15 +117,20 @@ class Paging:
         pages = self.cache.pages
         if pages is None:
             return math.inf
-        drop_s = self._rests_until_s if pages.spare() is not None else math.inf
-        return min(drop_s, self.queries.next_deadline_s())
+        spare = pages.spare() is not None
+        drop_s = self._rests_until_s if spare else math.inf
+        fills = not spare and len(self.sessions) and not self.cache.catalogue.complete
+        return min(drop_s, self.queries.next_deadline_s(), self._fill_s if fills else math.inf)
 
     def run_step(self, now_s: float) -> None:
-        """Drop one page if there are too many and nothing needs it."""
+        """Drop one page if there are too many and nothing needs it, or fetch one if the link is idle."""
         self.queries.answer_overdue(now_s)
         pages = self.cache.pages
-        page = pages.spare() if pages is not None and now_s >= self._rests_until_s else None
-        if pages is None or page is None:
+        if pages is None:
+            return
+        self._fill(pages, now_s)
+        page = pages.spare() if now_s >= self._rests_until_s else None
+        if page is None:
             return
         if self.is_needed(page):
             pages.want((page,), BACKGROUND)  # move it to the end: the next step checks another page
@@ -128,6 +138,22 @@ class Paging:
         else:
             pages.drop(page)
             self.scheduler.prefetcher.restart()
+
+    def _fill(self, pages: Pages, now_s: float) -> None:
+        """Fetch a page that nothing needs yet, near to one of the clients, if nothing else uses the link."""
+        link = self.scheduler.link
+        if now_s < self._fill_s or not len(self.sessions) or pages.spare() is not None:
+            return
+        self._fill_s = now_s + FILL_S
+        if len(self.scheduler.loads) or (link is not None and not link.is_idle(now_s)):
+            return
+        areas = [session.area for session in self.sessions if session.area is not None]
+        place = None
+        if areas:
+            min_x, min_y, max_x, max_y = areas[self._turn % len(areas)].bounds
+            place = 0.5 * (min_x + max_x), 0.5 * (min_y + max_y)
+            self._turn += 1
+        pages.want_nearest(place)
 
     def is_needed(self, page: int) -> bool:
         """Whether a page has to stay in memory."""

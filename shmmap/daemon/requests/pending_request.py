@@ -25,8 +25,6 @@ from shmmap.daemon.turns import Pace, Walk
 from shmmap.errors import NoSession
 from shmmap.geometry import Area, distance_to_boxes
 
-__all__ = ["LARGE", "MAX_OF_A_SESSION", "Finder", "Found", "MapChanged", "PendingRequest", "WaitingList"]
-
 MAX_OF_A_SESSION: Final = 64
 """Requests of one session that may wait; further ones are answered at once, with cold cells as pending."""
 MAX_REQUESTS: Final = 16_384
@@ -100,6 +98,8 @@ class PendingRequest:
         Requested area; None for a request by ids.
     message_cells
         Memory of the request's message, in cells.
+    spare
+        Whether it may cost other clients nothing; see `shmmap.protocol.messages.Selected`.
     needed, outstanding
         Cells protected from eviction for the request, and the loads it waits for.
     began_s, deadline_s
@@ -115,6 +115,7 @@ class PendingRequest:
     find: Finder
     area: Area | None = None
     message_cells: int = 0
+    spare: bool = False
     found: Found = field(default_factory=Found)
     needed: dict[Key, None] = field(default_factory=dict)
     outstanding: set[Key] = field(default_factory=set)

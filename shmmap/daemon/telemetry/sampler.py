@@ -2,8 +2,7 @@
 """Periodic measurements: a few times a second, the daemon's state is written to the statistics.
 
 A beat runs in the serving loop itself, so that a daemon that hangs stops beating; it takes several turns.
-While cells are added and removed, beats are more frequent but partial: only changes are written.  While
-nothing arrives they are rare.
+While nothing arrives beats are rare.
 """
 
 from __future__ import annotations
@@ -14,8 +13,7 @@ from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
 from dataclasses import dataclass, field
-from itertools import islice
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.holders import Survey
@@ -26,38 +24,22 @@ from shmmap.daemon.turns import WatchedDescriptors
 from shmmap.geometry import Area, Box, Circle
 from shmmap.protocol.rows import ClientRow, Window
 from shmmap.statistics.counters import REFUSALS, SPANS, WINDOWED
-from shmmap.statistics.layout import MAX_CLIENTS
 from shmmap.statistics.writer import StatisticsWriter
 
 if TYPE_CHECKING:
+    from shmmap.daemon.loading.link import Link
     from shmmap.daemon.map.published_origin import PublishedOrigin
     from shmmap.origin.remote.object_tier import ObjectCounts
-
-__all__ = [
-    "BEAT_S",
-    "IDLE_BEAT_S",
-    "PublishedGauges",
-    "RecentCounts",
-    "Sampler",
-    "SessionRows",
-    "client_row",
-]
 
 BEAT_S: Final = 0.25
 IDLE_BEAT_S: Final = 1.0
 """Interval of beats while the daemon is idle; it counts as hung after five seconds without one."""
 IDLE_AFTER_S: Final = 2.0
 """Time without a ready descriptor and without loads after which the daemon is idle."""
-CHANGE_BEAT_S: Final = 0.02
 EVENT_BEAT_S: Final = 1.0
 """Interval of publishing the last event's number, which reveals missed events."""
-ROWS_PER_BEAT: Final = 128
-ROWS_PER_TURN: Final = 16
-"""Rows of cells written per beat, and per turn of a beat: a tenth of a millisecond."""
 MAX_TURNS_OF_USED: Final = 4
-"""Turns, at most, in which a beat updates the rows of cells that clients were given."""
-CLIENT_ROWS_PER_BEAT: Final = 64
-"""Rows of clients updated per beat: half a millisecond."""
+"""Turns, at most, in which a beat checks the cells that clients were given."""
 SAMPLE_S: Final = 1.0
 """Interval of sampling the counters for the last minutes."""
 
@@ -100,40 +82,6 @@ class RecentCounts:
         return self._samples[max(0, found - 1)][1]
 
 
-class _Shown(NamedTuple):
-    state: tuple[object, ...]
-    number: int
-    row: ClientRow
-
-
-class SessionRows:
-    """Rows of sessions for operators; a bounded number is updated at a time."""
-
-    def __init__(self) -> None:
-        self._shown: dict[Session, _Shown] = {}
-        self._number = 0
-
-    def of(self, sessions: Iterable[Session]) -> list[ClientRow]:
-        """Return the rows of the first `MAX_CLIENTS` sessions.
-
-        Of the changed sessions, the oldest rows are replaced first; a new session has no row until its turn.
-        """
-        first = list(islice(sessions, MAX_CLIENTS))
-        shown = {session: self._shown[session] for session in first if session in self._shown}
-        outdated = [one for one in first if one not in shown or shown[one].state != _state(one)]
-        outdated.sort(key=lambda session: shown[session].number if session in shown else 0)
-        for session in outdated[:CLIENT_ROWS_PER_BEAT]:
-            self._number += 1
-            shown[session] = _Shown(_state(session), self._number, client_row(session))
-        self._shown = shown
-        return [shown[session].row for session in first if session in shown]
-
-
-def _state(session: Session) -> tuple[object, ...]:
-    """Return a value that changes whenever the session's row would change."""
-    return session.requests, session.connection, session.intent, len(session.held), session.held_bytes
-
-
 def client_row(session: Session) -> ClientRow:
     """Return the row of a client for operators."""
     intent, peer = session.intent, session.peer
@@ -172,7 +120,7 @@ class Sampler:
     waiting
         Collection of the requests that wait for loads; its length is measured.
     on_beat
-        Called after each complete beat.
+        Called after each beat.
     """
 
     cache: CellCache
@@ -185,45 +133,37 @@ class Sampler:
     waiting: Sized
     on_beat: Callable[[], None]
     _next_s: float = 0.0
-    _whole_s: float = 0.0
     _wakes: int = -1
-    _awake_s: float = 0.0  # of the last whole beat before which something had arrived
+    _awake_s: float = 0.0  # of the last beat before which something had arrived
     _idle: bool = False
     _beating: Iterator[None] | None = None
     _recent: RecentCounts = field(default_factory=lambda: RecentCounts(WINDOWED, SPANS.values()))
-    _rows: SessionRows = field(default_factory=SessionRows)
     _event_beat_s: float = float("-inf")
     _last_s: float = 0.0
     _outage_since_s: float | None = None
 
     @property
     def next_s(self) -> float:
-        """Return when the next beat, or part of one, is due: soon if cells were added, removed or changed."""
+        """Return when the next beat, or the next step of one, is due."""
         if self._beating is not None:
             return 0.0
         if self._idle and self.watched.wakes != self._wakes:
             self._idle = False
-            self._next_s = self._whole_s = self._last_s + BEAT_S
-        if self.statistics.outdated:
-            # a reader sees a change soon, yet a stream of changes costs little
-            return min(self._next_s, self._last_s + CHANGE_BEAT_S)
+            self._next_s = self._last_s + BEAT_S
         return self._next_s
 
     def run_step(self, now_s: float) -> None:
         """Begin a beat, or continue the current one."""
         if self._beating is None:
-            whole = now_s >= self._whole_s
-            if whole:
-                self._whole_s = now_s + self._interval_s(now_s)
-            self._last_s, self._next_s = now_s, self._whole_s
-            self._beating = self._beat(now_s, whole=whole)
+            self._last_s, self._next_s = now_s, now_s + self._interval_s(now_s)
+            self._beating = self._beat(now_s)
         beating, self._beating = self._beating, None
         with contextlib.suppress(StopIteration):
             next(beating)
             self._beating = beating
 
     def _interval_s(self, now_s: float) -> float:
-        """Return the time from a whole beat to the next one."""
+        """Return the time from a beat to the next one."""
         if self.watched.wakes != self._wakes or len(self.scheduler.loads) or len(self.waiting):
             self._wakes, self._awake_s = self.watched.wakes, now_s
         self._idle = now_s >= self._awake_s + IDLE_AFTER_S
@@ -242,7 +182,7 @@ class Sampler:
         set_value("events_published", self.event_log.last)
 
     def _look_around(self, now_s: float) -> None:
-        """Do the work that is not needed in each of many beats while cells load."""
+        """Sample the counters, and publish periodic reports and events."""
         values = self.statistics.values
         self._recent.look(values, now_s)
         for span, growth in zip(SPANS, self._recent.growth(values, now_s), strict=True):
@@ -275,36 +215,27 @@ class Sampler:
                 self._outage_since_s = None
                 statistics.set("origin_out_since_unix_ns", 0)
 
-    def _beat(self, now_s: float, *, whole: bool) -> Iterator[None]:
+    def _beat(self, now_s: float) -> Iterator[None]:
         """Run one beat; each step takes some tenths of a millisecond at most."""
         statistics = self.statistics
         pause = () if self._idle else (None,)  # between steps in which there is hardly anything to do then
-        if whole:
-            if self.survey.idle:  # else it is run as a background task
-                self.survey.step()
-            yield
-            self._look_around(now_s)
+        if self.survey.idle:  # else it is run as a background task
+            self.survey.step()
+        yield
+        self._look_around(now_s)
+        yield from pause
+        for _ in range(MAX_TURNS_OF_USED):
+            more = self.cache.check_used(now_s)
             yield from pause
-            statistics.show_clients(self._rows.of(self.sessions))
-            yield from pause
-            for _ in range(MAX_TURNS_OF_USED):
-                more = self.cache.show_used(now_s)
-                yield from pause
-                if not more:
-                    break
-        for _ in range(ROWS_PER_BEAT // ROWS_PER_TURN):
-            statistics.write_rows(ROWS_PER_TURN)
-            if not statistics.outdated:
+            if not more:
                 break
-            yield
         yield
         self.measure()
         yield from pause
-        statistics.beat(max_rows=0)
-        if whole:
-            yield
-            statistics.restore(now_s)
-            self.on_beat()
+        statistics.beat()
+        yield
+        statistics.restore(now_s)
+        self.on_beat()
 
 
 class PublishedGauges:
@@ -317,8 +248,10 @@ class PublishedGauges:
         self._statistics = statistics
         self._counts: ObjectCounts | None = None
 
-    def look(self, origin: PublishedOrigin) -> None:
-        """Write the served version, and the reads since the last call."""
+    def look(self, origin: PublishedOrigin, link: Link | None) -> None:
+        """Write the served version, the reads since the last call, and what the link is used for."""
+        if link is not None:
+            self._look_at(link)
         statistics, counts = self._statistics, origin.counts
         if counts != self._counts:
             statistics.add_objects_read(counts if self._counts is None else counts.since(self._counts))
@@ -332,3 +265,9 @@ class PublishedGauges:
             statistics.set("published_signed_unix_ns", int(taken.signed_s * 1e9))
         statistics.set("published_refused", origin.refused_version)
         statistics.set("published_refusal", REFUSALS.index(origin.refusal))
+
+    def _look_at(self, link: Link) -> None:
+        for cause, nbytes in link.received.items():
+            self._statistics.set(f"link_{cause}_bytes", nbytes)
+        self._statistics.set("link_rate_bytes", int(link.rate_bytes_s))
+        self._statistics.set("link_under_way_bytes", link.under_way_bytes)

@@ -32,8 +32,6 @@ from shmmap.protocol.codec import encode
 from shmmap.protocol.messages import ErrorReply
 from shmmap.statistics.writer import StatisticsWriter
 
-__all__ = ["MEMORY_ALLOWANCE_BYTES", "Connection", "Connections", "Listener", "Peer"]
-
 Socket: TypeAlias = socket.socket
 MAX_UNREAD_BYTES: Final = 16 << 20
 """Limit of unread replies; a client that leaves more does not read them."""
@@ -98,6 +96,7 @@ class Connection:
         self._watched = listener.watched
         self._incoming = Incoming(listener.kind, listener.peer_kind, listener.max_bytes)
         self._unsent: deque[memoryview] = deque()
+        self._behind = False  # whether the listener may have more to send, see its `on_read`
         self._cut = False
         self.fd = connected.fileno()
         self._watched.watch(self.fd, self._ready)
@@ -202,23 +201,24 @@ class Connection:
         self._watch()
         self.reweigh()
 
-    def _flush(self) -> None:
-        """Send the bytes that the kernel did not accept before."""
+    def _flush(self) -> bool:
+        """Send the bytes that the kernel did not accept before; return whether it has now taken them all."""
         while self._unsent:
             data = self._unsent[0]
             try:
                 taken = self._socket.send(data)
             except BlockingIOError:
-                return
-            except OSError:  # the peer has closed: the loop will notice
-                self._forget_unsent()
-                break
+                return False
+            except OSError:  # the peer takes nothing any more
+                self.cut()
+                return False
             self.unsent_bytes -= taken
             if taken < len(data):
                 self._unsent[0] = data[taken:]
-                return
+                return False
             self._unsent.popleft()
         self._watch()
+        return True
 
     def _ready(self) -> None:
         """Read, or send pending bytes; the descriptor is ready, or the peer has closed."""
@@ -226,9 +226,11 @@ class Connection:
             self.end()
             return
         if self._unsent:
-            self._flush()
-            if not self._unsent:
-                self._listener.on_read(self)
+            self._behind = self._flush()
+        if self._behind:
+            self._behind = self._listener.on_read(self)
+            if self._behind:
+                self._watched.call_again(self.fd)
         if not self._reading or not self._incoming.more:
             try:
                 data = self._socket.recv(READ_BYTES, 0 if self._reading else socket.MSG_PEEK)
@@ -354,7 +356,8 @@ class Listener:
     on_disconnect
         Called with a connection that was closed.
     on_read
-        Called with a connection whose client had left something unread, and has read it all.
+        Called with a connection whose client had left something unread, and has read it all; returns whether
+        there is more for it, for which it is called again in a later turn.
     """
 
     socket: Socket
@@ -366,7 +369,7 @@ class Listener:
     max_bytes: int
     on_message: Callable[[Connection, bytes, bool], None]
     on_disconnect: Callable[[Connection], None]
-    on_read: Callable[[Connection], None] = field(default=lambda _connection: None)
+    on_read: Callable[[Connection], bool] = field(default=lambda _connection: False)
 
     def move_to(self, other: Socket) -> None:
         """Listen at another socket; connections stay, and pending ones are accepted."""

@@ -21,8 +21,6 @@ from shmmap.errors import Busy
 from shmmap.protocol.codec import request_number
 from shmmap.statistics.writer import StatisticsWriter
 
-__all__ = ["MAX_PER_PROCESS", "MAX_PROCESS_BYTES", "FairQueue", "Inbox", "WorkItem"]
-
 Item = TypeVar("Item")
 
 MAX_PER_PROCESS: Final = 1024

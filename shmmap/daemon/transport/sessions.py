@@ -24,8 +24,6 @@ from shmmap.protocol.messages import Holder, Intent
 from shmmap.quantities import format_bytes
 from shmmap.segment.pins import MAX_SLOT
 
-__all__ = ["MOVES_PER_STEP", "Session", "Sessions"]
-
 MOVES_PER_STEP: Final = 4
 """Sessions whose motion is updated per step."""
 

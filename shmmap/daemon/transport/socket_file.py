@@ -16,8 +16,6 @@ from shmmap.errors import InstanceBusy
 from shmmap.logfmt import escaped
 from shmmap.segment.names import name_taken
 
-__all__ = ["SocketFile", "refuse_taken"]
-
 _OTHERWISE: Final = "choose another --endpoint"
 _CREDENTIALS: Final = struct.Struct("iII")  # struct ucred: pid, uid, gid
 

@@ -2,8 +2,8 @@
 """The daemon's side of ZMTP 3.0 with the NULL mechanism (rfc.zeromq.org/spec/23), as bytes of a connection.
 
 Clients use libzmq or any other ZeroMQ library.  The daemon does not: libzmq accepts connections without bound
-in a thread of its own, aborts the process when descriptors run out, stores everything that is sent, and
-reports neither the process of a connection nor its end.
+in a thread of its own, aborts the process when descriptors run out, stores everything that is sent, and does
+not report the end of a connection (its process it does, as ``Peer-Address``).
 """
 
 from __future__ import annotations
@@ -12,8 +12,6 @@ from collections.abc import Callable
 from typing import Final
 
 from shmmap.errors import BadRequest, ProtocolMismatch
-
-__all__ = ["GREETING", "Incoming", "framed", "framed_in_parts"]
 
 GREETING: Final = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)
 """Signature, version 3.0, mechanism, and 32 bytes that NULL ignores."""

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from shmmap.protocol.messages import Intent
 
-__all__ = ["FARTHEST_M", "MAX_SPEED_MPS", "MAX_VERTICES", "Motion", "Route"]
-
 MAX_SPEED_MPS: Final = 70.0
 """Speed limit of clients: a pose farther away than it allows is a jump."""
 LEARN_S: Final = 0.5

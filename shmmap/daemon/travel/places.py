@@ -23,8 +23,6 @@ from numpy.typing import NDArray
 
 from shmmap.daemon.travel.motion import Motion
 
-__all__ = ["MAX_PLACES", "NOWHERE", "Places", "merged_places", "places_of", "until_needed"]
-
 Places: TypeAlias = NDArray[np.float64]
 """(P, 8): x, y, arrival time of the client (s), its reach (m), how far beyond it the place is valid (m),
 seconds per metre beyond the reach, and the unit vector of its heading, 0 if unknown."""

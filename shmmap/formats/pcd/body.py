@@ -17,15 +17,6 @@ from shmmap.formats.pcd.header import PcdHeader
 from shmmap.formats.source_file import SourceFile, refusal
 from shmmap.formats.text_rows import RowParser
 
-__all__ = [
-    "ascii_blocks",
-    "check_sizes",
-    "compressed_blocks",
-    "decompress",
-    "field_arrays",
-    "record_blocks",
-]
-
 _BLOCK_BYTES: Final = 1 << 20  # bytes of file data per block, at most
 _BYTE: Final = np.dtype(np.uint8)
 

@@ -14,18 +14,6 @@ from numpy.typing import NDArray
 from shmmap.columns import ColumnSpec
 from shmmap.formats.source_file import refusal
 
-__all__ = [
-    "AXES",
-    "MAX_FIELDS",
-    "MAX_POINT_BYTES",
-    "PADDING",
-    "FieldProblem",
-    "FieldTable",
-    "PcdField",
-    "RawBlock",
-    "parse_fields",
-]
-
 MAX_FIELDS: Final = 1024
 MAX_POINT_BYTES: Final = 1 << 20
 MAX_NAME_BYTES: Final = 40  # bytes of a column's name in a segment

@@ -19,8 +19,6 @@ from shmmap.formats.pcd.fields import FieldProblem, FieldTable, PcdField, parse_
 from shmmap.formats.source_file import refusal
 from shmmap.formats.stated_units import decoded, system_of_comments
 
-__all__ = ["ENCODINGS", "HEADER_LIMIT_BYTES", "IDENTITY_VIEWPOINT", "PcdHeader", "parse_header"]
-
 HEADER_LIMIT_BYTES: Final = 1 << 16  # a header must end within this
 MAX_POINTS: Final = (1 << 32) - 1  # WIDTH and HEIGHT are uint32 in PCL
 ENCODINGS: Final = ("ascii", "binary", "binary_compressed")

@@ -16,8 +16,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["LITERAL_RUN", "MAX_RATIO", "TRUST_BYTES", "compress", "decompress", "first_error", "reachable"]
-
 LITERAL_RUN: Final = 32
 MAX_RATIO: Final = 88  # three bytes of input become at most 264 of output
 _LONG: Final = 7 << 5

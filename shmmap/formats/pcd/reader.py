@@ -30,12 +30,6 @@ from shmmap.formats.pcd.fields import AXES
 from shmmap.formats.pcd.header import HEADER_LIMIT_BYTES, PcdHeader, parse_header
 from shmmap.formats.source_file import FileReader, refusal
 
-__all__ = [
-    "Block",
-    "PcdReader",
-    "expanded_blocks",
-]
-
 Block = tuple[NDArray[Any], ...]
 
 _FIRST_READ_BYTES: Final = 2048  # long enough for nearly every header

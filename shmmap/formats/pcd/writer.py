@@ -16,8 +16,6 @@ from shmmap.formats.pcd import lzf
 from shmmap.formats.pcd.fields import PADDING
 from shmmap.formats.pcd.header import ENCODINGS, IDENTITY_VIEWPOINT
 
-__all__ = ["pcd_header", "pcd_rows", "write_pcd"]
-
 _BLOCK_POINTS: Final = 1 << 16
 _LZF_LIMIT_BYTES: Final = (1 << 31) - 1  # limit of liblzf's int sizes; the file's own size words are uint32
 _FORMATS: Final = {4: "%.9g", 8: "%.17g"}  # digits that restore the same bits

@@ -3,12 +3,16 @@
 
 The text of an obstore error may contain a signed URL.  So our messages repeat only the kind of the error and
 the HTTP status.
+
+Only the host of the URL is asked.  Redirects are refused, except that what is read may be fetched from
+another port of the same host: with no signature or key, but with the session token of temporary credentials,
+which is of no use without their key; and from ``https://`` to ``http://`` never.  Where requests go through a
+proxy (``https_proxy``, ``http_proxy``), redirects are for the proxy to refuse.
 """
 
 from __future__ import annotations
 
 import os
-import re
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -16,8 +20,9 @@ from datetime import timedelta
 from hashlib import sha256
 from typing import Any, Final, TypeVar
 
-from shmmap.errors import ConfigError, MapDataError, MapMissing, Offline
+from shmmap.errors import ConfigError, MapDataError, MapMissing
 from shmmap.lazy_imports import FOR_REMOTE, needed_packages
+from shmmap.origin.remote.bucket_errors import NOWHERE, failure, missing, refuse_unread
 from shmmap.origin.remote.conditions import (
     ASKED,
     Seen,
@@ -30,8 +35,6 @@ from shmmap.origin.remote.credentials import clean_variables, find_credentials
 from shmmap.origin.remote.store import (
     WEB_SCHEMES,
     Listed,
-    NoBucket,
-    NoTag,
     StoreRefused,
     StoreUrl,
     Tag,
@@ -50,13 +53,12 @@ from shmmap.origin.remote.transport import (
     too_slow,
     unasked_304,
 )
+from shmmap.origin.remote.unread_answers import UNREAD
 
 with needed_packages("a map in a bucket", together=FOR_REMOTE):
     import obstore
     from obstore import exceptions
     from obstore.store import AzureStore, GCSStore, S3Store
-
-__all__ = ["BucketStore", "SolePublisherStore", "server_url"]
 
 _Answer = TypeVar("_Answer")
 
@@ -65,38 +67,6 @@ _IMMUTABLE: Final = {
     "Content-Type": "application/zstd",
 }
 _CHANGES: Final = {"Cache-Control": "no-cache", "Content-Type": "application/json"}
-_STATUS: Final = re.compile(r"\b([45]\d\d)\b (?:[A-Z][A-Za-z ]+)|status(?: code)?:? ([1-9]\d\d)")
-_MOVED: Final = re.compile(r"status code: 30[12378]\b")
-_UNASKED: Final = re.compile(r"status code: 304\b")
-_AGAIN: Final = "try again later"
-_SILENT: Final = "is the network up, and the address right? (s3:// has it of AWS_ENDPOINT_URL and AWS_REGION)"
-_REGION: Final = "is AWS_REGION that of the bucket?"
-_CERTIFICATE: Final = "SSL_CERT_FILE names further authorities; is the clock right?"
-_ADDRESS: Final = "is the address that of a store, and is there such a bucket?"
-_CLOCK: Final = "are the credentials valid, and is the clock right?"
-_PANIC: Final = "this is a defect: please report it, with what the log says before"
-_TRUE_NAMES: Final = (
-    (
-        "Content-Length Header missing",
-        "its answer has no length",
-        f"is it sent in chunks? {BETWEEN}",
-    ),
-    (
-        "invalid list response",
-        "its answer is no listing of objects",
-        "is it a page, or compressed?",
-    ),
-    ("list response body", "its listing ended early", BETWEEN),
-    ("Parse(", "the answer is no HTTP", "is the address right, and its port?"),
-    ("source: Header {", "its answer has a header that cannot be read", BETWEEN),
-    ("source: Metadata {", "its answer has a header that cannot be read", BETWEEN),
-    ("source: InvalidContentType {", "its answer has a header that cannot be read", BETWEEN),
-    ("invalid utf-8 sequence", "refused, with an error that is no UTF-8", BETWEEN),
-)
-"""What is in the text of an obstore error, what it means, and a hint."""
-_NOWHERE: Final = "255.255.255.255:1"
-"""Where redirects to other hosts are sent: as obstore follows them all, credentials included, its proxy for
-all hosts but the store's is an address at which the kernel refuses every connection."""
 _HOSTS: Final = {
     "s3": "amazonaws.com,amazonaws.com.cn,api.aws,169.254.169.254,169.254.170.2,169.254.170.23,fd00:ec2::254",
     "gs": "googleapis.com,google.internal,169.254.169.254",
@@ -120,45 +90,7 @@ _BYTES_PER_PAGE: Final = 1 << 19
 _LEAST_BYTES: Final = 64 << 10
 _BYTES_RATIO: Final = 16
 """Sizes for which a store is opened: the least, and the ratio of two."""
-_LATER_S: Final = 1.0
-_ELSEWHERE: Final = "the bucket is in another region"
-_CODE: Final = re.compile(r"<Code>(\w+)</Code>")
-_REASONS: Final = {
-    "ExpiredToken": "the credentials have expired",
-    "TokenRefreshRequired": "the credentials have expired",
-    "InvalidAccessKeyId": "the store knows no such access key",
-    "InvalidToken": "the session token is not valid",
-    "SignatureDoesNotMatch": "the secret does not belong to the access key",
-    "RequestTimeTooSkewed": "this machine's clock differs from the store's",
-    "AccessDenied": "no permission",
-    "AllAccessDisabled": "the bucket's owner has disabled it",
-    "AccountProblem": "the account is closed or not paid for",
-    "InvalidBucketName": "no bucket can have this name",
-    "PermanentRedirect": _ELSEWHERE,
-    "TemporaryRedirect": _ELSEWHERE,
-    "AuthorizationHeaderMalformed": _ELSEWHERE,
-    "IllegalLocationConstraintException": _ELSEWHERE,
-    "AuthenticationFailed": "the account's key or token is not valid",
-    "AuthorizationFailure": "no permission",
-    "AuthorizationPermissionMismatch": "no permission",
-    "InsufficientAccountPermissions": "no permission",
-    "NoAuthenticationInformation": "it takes no requests without credentials",
-    "PublicAccessNotPermitted": "it takes no requests without credentials",
-    "ContainerBeingDeleted": "the container is being deleted",
-    "AccountIsDisabled": "the account is closed or not paid for",
-}
-"""Meanings of Amazon's error codes, which Google and others use, too, and of Azure's."""
-_HINTS: Final = {
-    _ELSEWHERE: _REGION,
-    "no permission": "may this account use this bucket? Its policy, or the account's roles, say so",
-    "the container is being deleted": _AGAIN,
-}
-"""Hints for reasons that are none of the credentials."""
-_NO_BUCKET: Final = re.compile(
-    r"<Code>(NoSuchBucket|ContainerNotFound)</Code>|The specified (bucket|container) does not exist"
-)
-"""In the answers of Amazon and Google (XML and JSON), and of Azure."""
-_NO_TAG: Final = "ETag Header missing"
+_LATER_S: Final = 2.0
 _OBJECTS_PER_PAGE: Final = 1000
 _MAX_LOOK_BYTES: Final = 1 << 16
 
@@ -280,6 +212,7 @@ class BucketStore:
             if page[0]["path"] in began:
                 raise StoreRefused(f"{self._name(prefix)}: its listing repeats without end", hint=BETWEEN)
             began.add(page[0]["path"])
+            UNREAD.take(_BYTES_PER_PAGE)
             for meta in page:
                 yield Listed(meta["path"], meta["size"], meta["last_modified"].timestamp())
         if not began:  # obstore takes a page for an empty listing
@@ -387,13 +320,12 @@ class BucketStore:
         conditional
             Raise the error of a failed condition unchanged.
         """
-        name = self._name(path)
+        name, ended = self._name(path), UNREAD.ended
         try:
-            return call_apart(ask, name, self._limit_s + more_s)
+            return call_apart(ask, name, self._limit_s + more_s, UNREAD.look)
         except (exceptions.NotFoundError, FileNotFoundError) as error:
-            if _NO_BUCKET.search(str(error)):
-                raise NoBucket(f"{name}: there is no such bucket", status=404) from None
-            raise MapMissing(f"{name} is not there") from None
+            refuse_unread(name, error, ended)
+            raise missing(name, error) from None
         except (exceptions.AlreadyExistsError, exceptions.PreconditionError):
             if conditional:
                 raise
@@ -405,8 +337,9 @@ class BucketStore:
         except BaseException as error:
             if not (is_panic(error) or isinstance(error, exceptions.BaseError | OSError)):
                 raise
+            refuse_unread(name, error, ended)
             self._refuse_bad_credentials(name)
-            raise _failure(name, error) from None
+            raise failure(name, error) from None
 
     def _refuse_bad_credentials(self, name: str) -> None:
         """Raise why credentials that are read again and again cannot be used any more, if so."""
@@ -416,28 +349,13 @@ class BucketStore:
             raise StoreRefused(f"{name}: {error.message}", hint=error.hint, of_credentials=True) from None
 
 
-def _failure(name: str, error: BaseException) -> Offline:
-    """Return our error for one of obstore; only parts of its text without secrets are repeated."""
-    text = str(error)
-    if is_panic(error):
-        return Offline(f"{name}: the request has made the package obstore fail", hint=_PANIC)
-    if isinstance(error, exceptions.PermissionDeniedError | exceptions.UnauthenticatedError):
-        why = _reason(text)
-        return StoreRefused(
-            f"{name}: refused, {why or 'no permission'}",
-            hint=_HINTS.get(why, _CLOCK),
-            of_credentials=True,
-            status=403,
-        )
-    return _out_of_reach(name, text)
-
-
 def _fill(name: str, body: Body, result: obstore.GetResult, limit_s: float) -> None:
     """Read the body of an answer; all bytes of objects in buckets come through here."""
     end_s = time.monotonic() + limit_s
     try:
         for piece in result.stream(min_chunk_size=1):
             body.add(memoryview(piece))
+            UNREAD.take(len(piece))
             if time.monotonic() > end_s and body.lacks:
                 raise too_slow(name, limit_s)
     except (exceptions.BaseError, OSError):
@@ -494,41 +412,6 @@ class SolePublisherStore(BucketStore):
 def _named(result: Any) -> Tag:
     """Return the tag from obstore's description of an object, or from its reply to a write."""
     return {key: result[key] for key in ("e_tag", "version") if result.get(key) is not None}
-
-
-def _out_of_reach(name: str, text: str) -> Offline:
-    """Return our error for the text of an obstore error; only parts without secrets are repeated."""
-    if _NO_BUCKET.search(text):
-        return NoBucket(f"{name}: there is no such bucket", status=404)
-    found = _STATUS.search(text)
-    status = int(found[1] or found[2]) if found is not None else 0
-    hint = _ADDRESS if status in (404, 405) else _CLOCK if 400 <= status < 500 else _AGAIN
-    if why := _reason(text):
-        hint = _HINTS.get(why, hint)
-        return StoreRefused(f"{name}: refused, {why}", hint=hint, of_credentials=True, status=status)
-    if _NOWHERE in text or _MOVED.search(text):
-        return StoreRefused(f"{name}: refused, it is somewhere else", hint=_REGION)
-    if _UNASKED.search(text):
-        return unasked_304(name)
-    if _NO_TAG in text:
-        return NoTag(f"{name}: its answer has no ETag", hint=BETWEEN)
-    for part, says, its_hint in _TRUE_NAMES:
-        if part in text:
-            return StoreRefused(f"{name}: {says}", hint=its_hint)
-    if status:
-        return StoreRefused(f"{name}: refused (status {status})", hint=hint, status=status)
-    if "redirect" in text.lower():
-        return StoreRefused(f"{name}: refused, it is somewhere else", hint=_REGION)
-    if "certificate" in text.lower():
-        return StoreRefused(f"{name}: the server's certificate is not accepted", hint=_CERTIFICATE)
-    in_time = " in time" if "kind: Timeout" in text else ""
-    return Offline(f"{name}: no answer{in_time}", hint=_SILENT)
-
-
-def _reason(text: str) -> str:
-    """Return the reason of a store's refusal if the text has a known error code; else an empty string."""
-    found = _CODE.search(text)
-    return _REASONS.get(found[1], "") if found is not None else ""
 
 
 def server_url(where: StoreUrl) -> str:
@@ -618,4 +501,4 @@ def _no_redirects(where: StoreUrl) -> dict[str, Any]:
             return {}
     urls = [store, *(os.environ.get(name, "") for name in _ASKED_FOR_CREDENTIALS)]
     hosts = [host for url in urls if (host := host_of(url))]
-    return {"proxy_url": f"http://{_NOWHERE}", "proxy_excludes": ",".join([*hosts, _HOSTS[where.scheme]])}
+    return {"proxy_url": f"http://{NOWHERE}", "proxy_excludes": ",".join([*hosts, _HOSTS[where.scheme]])}

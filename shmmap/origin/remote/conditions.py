@@ -3,7 +3,9 @@
 
 A publisher creates a version's entry only if there is none, and replaces ``CURRENT`` only if it is still what
 the publisher has seen.  Stores and proxies exist that ignore these conditions and answer 200: of two
-publishers at once, one would lose its version, and neither would notice.
+publishers at once, one would lose its version, and neither would notice.  (s3rver 3.7 ignores both
+conditions; OpenStack Swift 2.30 creates nothing with ``If-None-Match: *``.)  An ETag that is weak, as proxies
+make that compress, does not name a state.  What was written is read back after each new version.
 """
 
 from __future__ import annotations
@@ -15,16 +17,6 @@ from typing import Final, Literal, NamedTuple, Protocol, TypeAlias
 
 from shmmap.errors import CannotWrite, MapMissing
 from shmmap.origin.remote.store import NoTag, StoreRefused, Tag
-
-__all__ = [
-    "ASKED",
-    "ConditionalStore",
-    "Seen",
-    "ask_conditions",
-    "asked_content",
-    "refuse_foreign",
-    "refuse_unsafe_tag",
-]
 
 ASKED: Final = "conditions.json"
 """The object that publishers write to find out what the store can do; readers and pruning ignore it."""

@@ -3,6 +3,8 @@
 
 obstore reads the environment itself.  Without credentials it would ask the cloud's metadata address.  On a
 vehicle, nothing or an unknown machine answers there, so this is done only if it is configured.
+Credentials are checked when they are read; a daemon whose file of credentials is spoilt while it runs names
+that as the reason why the store is out of reach.
 """
 
 from __future__ import annotations
@@ -17,8 +19,6 @@ from typing import Any, Final, NamedTuple
 
 from shmmap.errors import ConfigError
 from shmmap.origin.remote.store import BUCKET_SCHEMES
-
-__all__ = ["Credentials", "clean_variables", "credentials_source", "find_credentials"]
 
 _DIRECTORY: Final = "CREDENTIALS_DIRECTORY"  # systemd.exec(5), LoadCredential=
 AWS_FILE: Final = "shmmap.aws"

@@ -26,34 +26,6 @@ from shmmap.origin.remote.store import ObjectReader, Store, StoreRefused, Tag, p
 from shmmap.origin.remote.zstd_frame import DAMAGED
 from shmmap.processes.request_threads import RequestThreads
 
-__all__ = [
-    "CURRENT",
-    "MAX_METADATA_BYTES",
-    "TIMESTAMP",
-    "Current",
-    "CurrentState",
-    "Entry",
-    "add_version",
-    "changed_meanwhile",
-    "earlier_versions",
-    "entry_path",
-    "list_entries",
-    "new_entry",
-    "new_entry_now",
-    "pack_json",
-    "read_current",
-    "read_entry",
-    "read_root",
-    "read_root_object",
-    "read_shard_object",
-    "read_shards",
-    "refuse_if_signed",
-    "require_current",
-    "require_served",
-    "root_path",
-    "unpack_current",
-]
-
 CURRENT: Final = "CURRENT"
 TIMESTAMP: Final = "timestamp.json"
 """File that names the current version of a signed map, see `shmmap.origin.remote.signed_metadata`."""

@@ -36,8 +36,6 @@ from shmmap.origin.remote.zstd_frame import DAMAGED
 from shmmap.private_directory import DIRECTORY_FLAGS, PRIVATE, NotPrivate, opened_private
 from shmmap.segment.writer import write_all
 
-__all__ = ["KeptObjects", "ObjectCounts", "ObjectTier", "kept_objects"]
-
 _BLOB: Final = re.compile("blobs/sha256/([0-9a-f]{64})")
 _ABSENT: Final = (errno.ENOENT, errno.ESTALE)
 _FULL: Final = (errno.ENOSPC, errno.EDQUOT)

@@ -16,13 +16,6 @@ from shmmap.origin.remote.store import LONG_RUN, SERVING, WEB_SCHEMES, Listed, S
 from shmmap.origin.remote.zstd_frame import DAMAGED
 from shmmap.private_directory import NotPrivate, open_followed, within
 
-__all__ = [
-    "DirectoryStore",
-    "ServedFrom",
-    "open_for_serving",
-    "open_store",
-]
-
 
 def open_store(
     url: str,

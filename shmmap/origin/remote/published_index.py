@@ -31,34 +31,6 @@ from shmmap.origin.remote.published_object import (
 from shmmap.origin.remote.zstd_frame import DAMAGED, unpack_frame
 from shmmap.segment.version import cell_version
 
-__all__ = [
-    "ENCODINGS",
-    "EXACT",
-    "MAX_LAYERS",
-    "MAX_ROOT_BYTES",
-    "MAX_SHARD_BYTES",
-    "MILLIMETRES",
-    "Damage",
-    "LayerObjects",
-    "Root",
-    "Shard",
-    "ShardTable",
-    "check_layers",
-    "check_shards",
-    "decode_map",
-    "is_id_prefix",
-    "is_relative_path",
-    "map_version_of",
-    "pack_fields",
-    "pack_root",
-    "pack_shard",
-    "published_layer_version",
-    "shard_keys",
-    "unpack_fields",
-    "unpack_root",
-    "unpack_shard",
-]
-
 MAX_ROOT_BYTES: Final = 16 << 20
 MAX_SHARD_BYTES: Final = 4 << 20
 FORMAT: Final = "shmmap published map"

@@ -37,28 +37,6 @@ from shmmap.segment.layout import (
 from shmmap.segment.version import Source, Stamp
 from shmmap.segment.writer import write_all
 
-__all__ = [
-    "MAX_OBJECT_BYTES",
-    "POINTS",
-    "STAMP_BYTES",
-    "CellIdentity",
-    "LayerSource",
-    "MillimetrePoints",
-    "ObjectName",
-    "bare_object",
-    "blob_path",
-    "from_millimetres",
-    "pack_object",
-    "pack_source",
-    "read_bare_header",
-    "read_points",
-    "rows_of",
-    "stamp_of",
-    "to_millimetres",
-    "unpack_source",
-    "write_segment",
-]
-
 POINTS: Final = "points"
 """Spec of the layer that each published map has."""
 MAX_OBJECT_BYTES: Final = 1 << 30

@@ -19,23 +19,6 @@ from shmmap.origin.remote.map_versions import MAX_METADATA_BYTES, TIMESTAMP, Cur
 from shmmap.origin.remote.published_index import MAX_ROOT_BYTES
 from shmmap.origin.remote.store import Store, Tag
 
-__all__ = [
-    "ALTERED",
-    "EXPIRED",
-    "FOREIGN_ROOT",
-    "OLDER",
-    "TARGET",
-    "UNSIGNED",
-    "SignedState",
-    "current_of",
-    "is_foreign",
-    "metadata_path",
-    "newest_root",
-    "read_signed_state",
-    "refused",
-    "target_of",
-]
-
 TARGET: Final = "root"
 _MAX_ROTATIONS: Final = 256
 _NUMBER: Final = "map_version"

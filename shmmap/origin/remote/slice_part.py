@@ -34,22 +34,6 @@ from shmmap.origin.remote.published_index import (
 from shmmap.origin.remote.published_object import POINTS
 from shmmap.origin.remote.zstd_frame import pack_frame, unpack_frame
 
-__all__ = [
-    "MAX_PART_BYTES",
-    "MAX_SLICES",
-    "PARTS",
-    "Part",
-    "RunName",
-    "pack_part",
-    "part_number",
-    "read_run",
-    "run_of",
-    "shards_of",
-    "slice_of_shards",
-    "unpack_part",
-    "with_parts",
-]
-
 PARTS: Final = "parts/"
 MAX_PART_BYTES: Final = 16 << 20
 """Size limit of a part's object, packed and unpacked."""

@@ -16,30 +16,6 @@ from urllib.parse import urlsplit
 
 from shmmap.errors import BadRequest, MapMissing, Offline
 
-__all__ = [
-    "BUCKET_SCHEMES",
-    "LONG_RUN",
-    "PROBE",
-    "SERVING",
-    "WEB_SCHEMES",
-    "Listed",
-    "NoBucket",
-    "NoTag",
-    "ObjectReader",
-    "Store",
-    "StoreRefused",
-    "StoreUrl",
-    "Tag",
-    "Timeouts",
-    "is_loopback",
-    "is_published",
-    "is_url",
-    "may_be_plain",
-    "put_over",
-    "read_url",
-    "refuse_read_only",
-]
-
 BUCKET_SCHEMES: Final = ("s3", "gs", "az")
 WEB_SCHEMES: Final = ("https", "http")
 _SCHEMES: Final = ("file", *BUCKET_SCHEMES, *WEB_SCHEMES)

@@ -30,8 +30,6 @@ from shmmap.origin.remote.map_versions import Current
 from shmmap.origin.remote.published_index import MAX_ROOT_BYTES
 from shmmap.private_directory import NotPrivate, require_private
 
-__all__ = ["Judgement", "TakenVersion", "TakenVersionFile", "judge_offer"]
-
 _MAGIC: Final = b"SHMTAKEN"
 _FORMAT: Final = 1
 _HEAD: Final = struct.Struct("<8sI")

@@ -5,14 +5,35 @@ A limit for each read alone would let a server that sends a byte a second hold a
 whole answer has one: ``read_s`` and a second for every 64 KiB of it.  Bodies are read against the clock; what
 a library does before and after runs in a thread that is left alone when its time is over.  A main thread that
 waits for either still handles signals.
+
+=========================================  ==========================  ===================================
+what                                       ``serve``                   ``fetch versions publish prepare``
+=========================================  ==========================  ===================================
+a connection                               1 s                         10 s
+silence, before or within an answer        2 s; asked once more        30 s; asked once more
+a whole answer, with its redirects         2 s and 1 s for 64 KiB,     30 s and 1 s for 64 KiB,
+                                           at least 3 s                at least 31 s
+a bucket's error, or an answer without an  5.5 s                       62 s
+object
+an object sent to a bucket                                             62 s and 2 s for 64 KiB
+a thousand names of a listing                                          70 s
+refused connections, statuses 429 and 5xx  again twice, for 2.5 s      again 8 times, for 31 s
+=========================================  ==========================  ===================================
+
+An answer that is not complete at its limit is not asked for again: the object is offline.  What is slow, or
+has failed in the last minute, takes no place from other objects.
 """
 
 from __future__ import annotations
 
+import contextlib
+import contextvars
 import math
 import threading
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, wait
+from functools import partial
 from typing import Final, NoReturn, TypeVar
 
 from shmmap.errors import BadRequest, MapDataError, Offline
@@ -20,31 +41,35 @@ from shmmap.origin.remote.store import WEB_SCHEMES, StoreRefused, StoreUrl, is_l
 from shmmap.origin.remote.zstd_frame import DAMAGED
 from shmmap.processes.request_threads import PREFIX
 
-__all__ = [
-    "BETWEEN",
-    "BYTES_PER_S",
-    "Body",
-    "Incomplete",
-    "answer_limit_s",
-    "call_apart",
-    "host_of",
-    "is_panic",
-    "refuse_page",
-    "refuse_plain_http",
-    "too_slow",
-    "unasked_304",
-]
-
 _Answer = TypeVar("_Answer")
 
 BYTES_PER_S: Final = 64 << 10
 """Rate below which an answer is given up."""
 _PANICS: Final = ("PanicException", "RustPanic")
 BETWEEN: Final = "does a proxy between here and the store change its answers?"
+_LOOK_S: Final = 0.1
 _PAGE_BYTES: Final = 64 << 10
 _PORTAL: Final = "is this the login page of a network, or another server than the map's?"
 _CUT: Final = "does the store, or something between here and it, end transfers early?"
 _SLOW: Final = "is the link this slow, or does something between here and the store hold its answers back?"
+
+
+_ARRIVED: Final[contextvars.ContextVar[Callable[[int], None]]] = contextvars.ContextVar(
+    "arrived", default=lambda _nbytes: None
+)
+
+
+@contextlib.contextmanager
+def reporting_bytes(report: Callable[[int], None]) -> Iterator[None]:
+    """Within the block, call ``report`` with the number of bytes of each piece of an answer that comes.
+
+    It is called in the thread that reads the answer.
+    """
+    token = _ARRIVED.set(report)
+    try:
+        yield
+    finally:
+        _ARRIVED.reset(token)
 
 
 def answer_limit_s(read_s: float, nbytes: int) -> float:
@@ -98,6 +123,7 @@ class Body:
         if size is not None and size > self._most:
             self._refuse_size(size)
         self._data = bytearray(size or 0)
+        self._arrived = _ARRIVED.get()
         self.at = 0
 
     def add(self, piece: bytes | memoryview) -> None:
@@ -109,6 +135,7 @@ class Body:
             self._data.extend(bytes(end - len(self._data)))
         self._data[self.at : end] = piece
         self.at = end
+        self._arrived(len(piece))
 
     @property
     def lacks(self) -> bool:
@@ -180,10 +207,16 @@ def is_panic(error: BaseException) -> bool:
 # --- waiting ------------------------------------------------------------------------------------------
 
 
-def call_apart(call: Callable[[], _Answer], name: str = "", limit_s: float = math.inf) -> _Answer:
+def call_apart(
+    call: Callable[[], _Answer],
+    name: str = "",
+    limit_s: float = math.inf,
+    look: Callable[[], None] = lambda: None,
+) -> _Answer:
     """Call a function that may block; the main thread still handles signals meanwhile.
 
     After the limit, or an exception of a signal handler, the call goes on in a thread until it ends.
+    ``look`` is called again and again while this one waits.
 
     Raises
     ------
@@ -194,16 +227,26 @@ def call_apart(call: Callable[[], _Answer], name: str = "", limit_s: float = mat
         return call()
     future: Future[_Answer] = Future()
 
-    def run() -> None:
-        try:
-            future.set_result(call())
-        except BaseException as error:  # noqa: BLE001  raised in the thread that waits
-            future.set_exception(error)
-
     try:
-        threading.Thread(target=run, name=f"{PREFIX}apart", daemon=True).start()
+        within = partial(contextvars.copy_context().run, call)
+        threading.Thread(target=_run, args=(within, future), name=f"{PREFIX}apart", daemon=True).start()
     except RuntimeError:  # the system allows no more threads
         return call()
-    if not wait([future], None if math.isinf(limit_s) else limit_s).done:
-        raise too_slow(name, limit_s)
-    return future.result()
+    end_s = time.monotonic() + limit_s
+    try:
+        while not wait([future], min(_LOOK_S, end_s - time.monotonic())).done:
+            if time.monotonic() >= end_s:
+                raise too_slow(name, limit_s)
+            look()
+        return future.result()
+    finally:
+        del future  # else an error, whose text may be long, is kept by its own traceback
+
+
+def _run(call: Callable[[], _Answer], future: Future[_Answer]) -> None:
+    try:
+        future.set_result(call())
+    except BaseException as error:  # noqa: BLE001  raised in the thread that waits
+        future.set_exception(error)
+    finally:
+        del future

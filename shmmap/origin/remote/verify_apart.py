@@ -18,16 +18,6 @@ from shmmap.origin.reading_apart import Outcome, ended_early, not_started
 from shmmap.origin.remote.map_versions import MAX_METADATA_BYTES, Current
 from shmmap.processes.start_child import packet_buffer, receive_packet, start_child
 
-__all__ = [
-    "Verified",
-    "VerifyReply",
-    "VerifySettings",
-    "memory_directory",
-    "no_root_of_trust",
-    "read_trusted_root",
-    "verify_apart",
-]
-
 _TIMEOUT_S: Final = 300.0
 _NO_ROOT: Final = "it is the ROOT.json that `publish --sign` makes"
 

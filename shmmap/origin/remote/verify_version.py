@@ -43,8 +43,6 @@ if TYPE_CHECKING:
 
     from shmmap.origin.remote.store import Store
 
-__all__ = ["verify_version"]
-
 _URL = "map:///"  # the updater names objects by URL; the rest of the URL is a path at the store
 _ROLES: Final = ("timestamp", "snapshot", "targets", "root")
 _NICE: Final = 5

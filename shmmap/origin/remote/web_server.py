@@ -35,8 +35,6 @@ from shmmap.origin.remote.transport import (
     unasked_304,
 )
 
-__all__ = ["WebServer"]
-
 _READ_ONLY: Final = "a web server cannot be written to: publish to its directory, or to the bucket behind it"
 _SILENT: Final = "is the network up, and the address right?"
 _AGAIN: Final = "try again later"

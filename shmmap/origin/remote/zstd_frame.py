@@ -11,8 +11,6 @@ from shmmap.lazy_imports import FOR_REMOTE, needed_packages
 with needed_packages("a published map", together=FOR_REMOTE):
     import zstandard
 
-__all__ = ["DAMAGED", "pack_frame", "unpack_frame"]
-
 LEVEL: Final = 3  # level 1 is twice as fast, and its frames are 1.6 % larger
 DAMAGED: Final = "damaged"
 """`MapDataError.cause` of objects that differ from the published ones."""

@@ -27,8 +27,6 @@ from tests.support.message_pack import pack
 from tests.support.process_costs import processor_s
 from tests.support.raw_client import RawClient, pack_versions
 
-__all__ = ["beside_hostile_and_busy"]
-
 PERIOD_S = 0.005
 SETTLE_S = 0.3
 MEDDLERS = 3

@@ -49,6 +49,15 @@ def error_m(result: Result) -> float:
     return float(np.linalg.norm(result.T_map_base[:3, 3] - TRUTH[:3]))
 
 
+def test_a_result_prints_as_one_line(points: NDArray[np.float64], scan: NDArray[np.float64]) -> None:
+    shown = repr(aligned(map_of(points, 2.0), scan, backend="numpy"))
+    assert re.fullmatch(
+        r"<Result at x -?\d+\.\d{3}, y \S+, z \S+ m, yaw \S+ deg: NVTL \d\.\d\d, \d+ steps, trusted>", shown
+    ), shown
+    assert repr(aligned(VoxelMap({}), scan, backend="numpy")).endswith("not trusted (no_map)>")
+    assert re.fullmatch(r"<VoxelMap of \d+ cells, \d+ voxels of 2 m>", repr(map_of(points, 2.0)))
+
+
 @pytest.mark.parametrize("variant", ["autoware", "pclomp", "pcl"])
 @pytest.mark.parametrize("neighbors", ["direct1", "direct7", "radius"])
 @pytest.mark.parametrize("line_search", [False, True])

@@ -29,11 +29,11 @@ from shmmap_clients.ndt_scan_matcher.drive.drive_summary import (
     frame_document,
     pose_errors,
 )
-from shmmap_clients.ndt_scan_matcher.drive.motion_prediction import ConstantVelocity, Odometry, interpolate
+from shmmap_clients.ndt_scan_matcher.drive.motion_prediction import ConstantVelocity, Odometry
 from shmmap_clients.ndt_scan_matcher.drive.pose_stream import OdometrySubscriber, PosePublisher, decode_pose
 from shmmap_clients.ndt_scan_matcher.map.map_updater import UpdateStatistics
 from shmmap_clients.scans.scan_file import thinned
-from shmmap_clients.scans.trajectory import Trajectory
+from shmmap_clients.scans.trajectory import Trajectory, interpolate
 from shmmap_clients.spread import KEPT
 
 import shmmap
@@ -179,12 +179,12 @@ def test_the_summary_in_words_leaves_out_what_has_no_data(capsys: pytest.Capture
     assert "on the device" not in out
     updates.uploads.written_bytes, updates.uploads.writes = 5_360_000, 2
     print_summary(statistics.summary(updates, 0, TrustLimits(nvtl=2.3)))
-    assert "5.36 MB written in 2 writes\n" in capsys.readouterr().out
+    assert "5.1 MiB written in 2 writes\n" in capsys.readouterr().out
     updates.uploads.laid_out_again = 3
     print_summary(statistics.summary(updates, 0, TrustLimits(nvtl=2.3)))
-    assert "5.36 MB written in 2 writes, laid out again 3 times\n" in capsys.readouterr().out
+    assert "5.1 MiB written in 2 writes, laid out again 3 times\n" in capsys.readouterr().out
     assert "updates: 1, cells added: 64, cells removed: 0" in out
-    assert "0.06 MB at most, beside the shared memory" in out
+    assert "58.6 KiB at most, beside the shared memory" in out
     rows = [line.split("  ")[0] for line in out.splitlines() if " variance " in line]
     assert "latency, ms" in rows
     assert "map request, ms" in rows

@@ -15,8 +15,6 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Textbook", "rotation"]
-
 _LEAST_POINTS = 6
 _LEAST_RATIO = 0.01  # of a covariance's eigenvalues, section 6.2.1
 _COMPLEX_STEP = 1e-40

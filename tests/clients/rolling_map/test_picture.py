@@ -8,11 +8,13 @@ import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from numpy.typing import NDArray
+from shmmap_clients.rolling_map.live_map import usage_text
 from shmmap_clients.rolling_map.picture import STATES, HeightColours, MapContent, map_picture
 
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.live import ChunkInfo
+from shmmap.live import ChunkInfo, LiveMapRow
 from tests.support.pictures import SVG, rasters
 
 RESOLUTION = 0.5
@@ -117,9 +119,9 @@ def test_only_what_is_chosen_is_in_the_legend() -> None:
         assert word not in nothing
     assert "height" in words(MapContent(RESOLUTION, occupied=centers((0, 0, 0))))
     assert "free" in words(MapContent(RESOLUTION, free=centers((0, 0, 0))))
-    path = MapContent(RESOLUTION, path=[(0.0, 0.0, 1.0), (3.0, 4.0, 1.0)], usage="7 active cells, 1 < 2 MB")
+    path = MapContent(RESOLUTION, path=[(0.0, 0.0, 1.0), (3.0, 4.0, 1.0)], usage="7 voxels known, 1 < 2 MB")
     assert "sensor's path" in words(path)
-    assert "7 active cells, 1 < 2 MB" in words(path)
+    assert "7 voxels known, 1 < 2 MB" in words(path)
 
 
 def test_the_path_is_where_the_sensor_was() -> None:
@@ -139,3 +141,10 @@ def test_a_large_map_is_made_coarser() -> None:
     assert max(above.shape) <= 2400
     assert above[-1, 0, 3] == above[0, -1, 3] == 255
     assert drawn(MapContent(1e-3, path=[(0.0, 0.0, 0.0)])) is not None, "and a very small one is drawn"
+
+
+def test_the_size_of_a_map_in_words() -> None:
+    row = LiveMapRow("lidar", "/live", 0.1, "map", 12, 1_234_567, 4 << 20, 0, 0, 0, 1 << 20, 0, 0, 0, 0, 0)
+    assert usage_text(row) == "1,234,567 voxels known, 4.0 MiB, 12 chunks, 1.0 MiB waiting"
+    one = replace(row, chunks=1, active=1, waiting_bytes=0)
+    assert usage_text(one) == "1 voxel known, 4.0 MiB, 1 chunk"

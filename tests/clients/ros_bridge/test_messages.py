@@ -3,7 +3,11 @@
 
 from __future__ import annotations
 
+import json
+import os
+import re
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,22 +18,30 @@ from hypothesis import strategies as st
 pytest.importorskip("cyclonedds", reason="needs the package cyclonedds")
 
 from shmmap_clients.ros_bridge import cdr
-from shmmap_clients.ros_bridge.cdr import CdrWriter, Content, copy_into
+from shmmap_clients.ros_bridge.cdr import CdrWriter, Content, copy_into, write_cloud
 from shmmap_clients.ros_bridge.messages import (
     DIFFERENTIAL,
+    FREE,
     OCCUPIED,
+    PARTIAL,
+    SELECTED,
     CellMetaData,
     CellWithID,
     Damaged,
     Header,
+    MapMetaData,
     PointCloud2,
     PointField,
     Time,
     VoxelGrid,
     ready_made,
 )
-from shmmap_clients.ros_bridge.parameters import ParameterValue
-from shmmap_clients.ros_bridge.point_cloud import cloud_layout, fill_rows, write_cloud
+from shmmap_clients.ros_bridge.parameters import PARAMETER_SERVICES, ParameterValue
+from shmmap_clients.ros_bridge.type_hashes import HASHES, type_hash
+from shmmap_clients.ros_cells import cloud_layout, fill_rows
+
+from tests.support import type_hashes
+from tests.support.ros.environment import environment_folder
 
 TEXTS = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=9)
 SETTINGS = settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.too_slow])
@@ -41,7 +53,7 @@ def padded(data: bytes) -> bytes:
 
 
 @st.composite
-def clouds(draw: st.DrawFn) -> tuple[dict[str, Any], PointCloud2]:
+def clouds(draw: st.DrawFn) -> tuple[dict[str, Any], Any]:
     """Columns, and the message that they should be."""
     rows = draw(st.integers(0, 5))
     random = np.random.default_rng(draw(U32))
@@ -71,14 +83,14 @@ def clouds(draw: st.DrawFn) -> tuple[dict[str, Any], PointCloud2]:
     )
 
 
-def write(writer: CdrWriter, columns: dict[str, Any], like: PointCloud2) -> None:
+def write(writer: CdrWriter, columns: dict[str, Any], like: Any) -> None:
     stamp_ns = like.header.stamp.sec * 10**9 + like.header.stamp.nanosec
     write_cloud(writer, columns, (0.0, 0.0, 0.0), like.header.frame_id, stamp_ns)
 
 
 @SETTINGS
 @given(clouds())
-def test_a_cloud_is_written_as_the_serializer_does(cloud: tuple[dict[str, Any], PointCloud2]) -> None:
+def test_a_cloud_is_written_as_the_serializer_does(cloud: tuple[dict[str, Any], Any]) -> None:
     columns, message = cloud
     writer = CdrWriter()
     write(writer, columns, message)
@@ -93,7 +105,7 @@ def test_a_cloud_is_written_as_the_serializer_does(cloud: tuple[dict[str, Any], 
 @SETTINGS
 @given(st.lists(st.tuples(TEXTS, clouds()), max_size=3), st.lists(TEXTS, max_size=3), U32)
 def test_a_reply_is_written_as_the_serializer_does(
-    cells: list[tuple[str, tuple[dict[str, Any], PointCloud2]]], removed: list[str], client: int
+    cells: list[tuple[str, tuple[dict[str, Any], Any]]], removed: list[str], client: int
 ) -> None:
     """Parts of several clouds stand at the right places."""
     box = (-1.5, 2.0, 18.5, 22.0)
@@ -188,3 +200,28 @@ def test_bytes_that_are_no_message_are_damaged() -> None:
     for end in range(4, len(data) - 8, 3):
         found = ParameterValue.deserialize(data[:end])
         assert isinstance(found, Damaged), end
+
+
+def test_hashes_are_those_of_the_types() -> None:
+    """As REP 2016 makes them of the very types that are sent."""
+    services = [PARTIAL, DIFFERENTIAL, SELECTED, OCCUPIED, FREE, *PARAMETER_SERVICES.values()]
+    kinds = [PointCloud2, MapMetaData, *(kind for one in services for kind in (one.request, one.reply))]
+    for kind in kinds:
+        assert type_hash(kind) == f"typehash={type_hashes.type_hash(kind)};", kind
+    assert {kind.__name__ for kind in kinds} == set(HASHES)
+
+
+def test_hashes_are_those_of_ros() -> None:
+    """As its packages and Autoware's have them, where they are installed, or made for the tests."""
+    prefixes = [environment_folder(), *map(Path, os.environ.get("AMENT_PREFIX_PATH", "").split(":"))]
+    services = [PARTIAL, DIFFERENTIAL, SELECTED, *PARAMETER_SERVICES.values()]
+    found = {}
+    for kind in (PointCloud2, MapMetaData, *(kind for one in services for kind in (one.request, one.reply))):
+        name = type_hashes.ros_name(kind)
+        file = f"{re.sub('_(Request|Response)$', '', name)}.json"
+        for path in (one / "share" / file for one in prefixes if (one / "share" / file).exists()):
+            for row in json.loads(path.read_text())["type_hashes"]:
+                found[row["type_name"]] = row["hash_string"]
+            assert type_hash(kind) == f"typehash={found[name]};"
+    if not found:
+        pytest.skip("needs ROS 2: python -m tests.support.ros, or AMENT_PREFIX_PATH")

@@ -1,84 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the bridge decides without DDS: areas, versions of clients, names, parameters, turns."""
+"""What the bridge decides without DDS: names, parameters, turns, settings."""
 
 from __future__ import annotations
 
-import math
+import re
 from types import SimpleNamespace
 from typing import Any
+from xml.etree import ElementTree
 
-import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 pytest.importorskip("cyclonedds", reason="needs the package cyclonedds")
 
 from shmmap_clients.ros_bridge import participant
-from shmmap_clients.ros_bridge.map_answers import RecentCells, Requesters, sensible, touches
 from shmmap_clients.ros_bridge.parameters import Parameters
 from shmmap_clients.ros_bridge.participant import settings
 from shmmap_clients.ros_bridge.service_server import Request, Requester
 from shmmap_clients.ros_bridge.worker import MAX_PER_CLIENT, MAX_WAITING, WaitingRequests
 
 import shmmap
-
-F32 = st.floats(width=32) | st.sampled_from([math.inf, -math.inf, math.nan, 0.0])
-SMALL = st.floats(-50, 50, width=32)
-
-
-def autoware_touches(x: float, y: float, radius: float, box: tuple[float, ...]) -> bool:
-    """``cylinder_and_box_overlap_exists`` of autoware_map_loader's utils.cpp, both clauses."""
-    low_x, low_y, high_x, high_y = (float(np.float32(one)) for one in box)
-    if low_x - radius <= x <= high_x + radius and low_y - radius <= y <= high_y + radius:
-        return True
-    return any(math.hypot(x - a, y - b) <= radius for a in (low_x, high_x) for b in (low_y, high_y))
-
-
-@given(F32 | SMALL, F32 | SMALL, F32 | SMALL, st.lists(st.tuples(SMALL, SMALL), max_size=4))
-def test_areas_touch_what_autoware_s_touch(
-    x: float, y: float, radius: float, corners: list[tuple[float, float]]
-) -> None:
-    area = SimpleNamespace(center_x=x, center_y=y, radius=radius)
-    boxes = np.array([(a, b, a + 20.0, b + 20.0) for a, b in corners], float).reshape(-1, 4)
-    found = touches(area, boxes)
-    assert found.tolist() == [autoware_touches(x, y, radius, tuple(box)) for box in boxes.tolist()]
-    square = sensible(area)
-    assert (square is not None) == (all(map(math.isfinite, (x, y, radius))) and radius >= 0)
-    if square is not None:
-        assert square.overlaps(boxes).tolist() == found.tolist()
-
-
-# --- versions -----------------------------------------------------------------------------------------
-
-
-def test_what_a_client_was_sent_is_what_it_holds() -> None:
-    requesters = Requesters(most=2)
-    now = {"a": 1, "b": 2, "c": 3}
-    held = requesters.held("one", ["a", "x", "a"], now)
-    assert held == [("a", 1), ("x", None)], "ours to know are current, once"
-    requesters.answered("one", held, ["x"], {"b": 2})
-    now = {"a": 10, "b": 20}
-    assert requesters.held("one", ["b", "a"], now) == [("b", 2), ("a", 1)]
-    assert requesters.held("two", ["b"], now) == [("b", 20)], "another client's"
-    requesters.answered("one", requesters.held("one", ["b"], now), ["b"], {"a": 10})
-    assert requesters.held("one", ["a", "b"], now) == [("a", 10), ("b", 20)]
-
-
-def test_the_one_that_has_not_asked_for_longest_is_forgotten() -> None:
-    requesters = Requesters(most=2)
-    for client in ("one", "two", "one", "three"):
-        requesters.answered(client, [], [], {"a": 1})
-    assert len(requesters) == 2
-    assert [requesters.held(client, ["a"], {"a": 5})[0][1] for client in ("one", "two", "three")] == [
-        1,
-        5,
-        1,
-    ]
-    requesters.keep_only({"three", "four"})
-    assert len(requesters) == 1
-    assert requesters.held("three", ["a"], {}) == [("a", 1)]
-
 
 # --- turns --------------------------------------------------------------------------------------------
 
@@ -96,8 +36,9 @@ def test_a_client_has_few_requests_waiting_and_its_newest_count() -> None:
             assert waiting.put(request("other"))
     taken = [waiting.get() for _ in range(len(waiting))]
     assert [(one.requester.name, one.message) for one in taken] == [
+        ("flood", 3),
         ("other", 0),
-        *(("flood", number) for number in range(3, MAX_PER_CLIENT + 3)),
+        *(("flood", number) for number in range(4, MAX_PER_CLIENT + 3)),
     ]
     assert not waiting
     for number in range(MAX_WAITING):
@@ -106,18 +47,21 @@ def test_a_client_has_few_requests_waiting_and_its_newest_count() -> None:
 
 
 def test_clients_take_turns() -> None:
-    """However many one has waiting, and what could not be answered yet comes after all others."""
+    """However many one has waiting; what could not be answered yet comes before its client's others."""
     waiting = WaitingRequests()
     for number in range(MAX_PER_CLIENT):
         waiting.put(request("greedy", number))
     waiting.put(request("other"))
     slow = waiting.get()
-    waiting.requeue(slow)
     waiting.put(request("new"))
+    waiting.put_back(slow)
     taken = [waiting.get() for _ in range(len(waiting))]
-    assert [one.requester.name for one in taken[:3]] == ["other", "new", "greedy"]
-    assert {one.requester.name for one in taken[3:]} == {"greedy"}
-    assert sorted(one.message for one in taken if one.requester.name == "greedy") == [0, 1, 2, 3]
+    assert [one.requester.name for one in taken] == ["other", "greedy", "new", "greedy", "greedy", "greedy"]
+    assert [one.message for one in taken if one.requester.name == "greedy"] == [0, 1, 2, 3]
+    for number in range(1, MAX_PER_CLIENT + 1):
+        waiting.put(request("greedy", number))
+    waiting.put_back(slow)
+    assert [waiting.get().message for _ in range(len(waiting))] == [1, 2, 3, 4], "the newest count"
 
 
 # --- names --------------------------------------------------------------------------------------------
@@ -157,6 +101,32 @@ def test_settings_are_the_user_s_and_those_of_ros() -> None:
     assert both.endswith(",file:///x.xml"), "so that it counts over the other"
     assert "127.0.0.1" in both
     assert "127.0.0.1" not in settings({"ROS_LOCALHOST_ONLY": "0"})
+    near = settings({"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_STATIC_PEERS": "10.0.0.1;a<b"})
+    assert "<AllowMulticast>false<" in near
+    assert "127.0.0.1" in near
+    assert "autodetermine" in near, "for the other peers"
+    assert "autodetermine" not in settings({"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"})
+    assert re.findall(r"Peer address=\S+?/>", near) == [
+        'Peer address="localhost"/>',
+        'Peer address="10.0.0.1"/>',
+        'Peer address="a&lt;b"/>',
+    ]
+    peers = settings({"ROS_STATIC_PEERS": "10.0.0.1"})
+    assert "localhost" not in peers
+    assert "AllowMulticast" not in peers
+    assert '<Peer address="10.0.0.1"/>' in peers
+    assert settings({"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}) == ""
+    off, default = (
+        settings({"ROS_AUTOMATIC_DISCOVERY_RANGE": one, "ROS_STATIC_PEERS": "10.0.0.1"})
+        for one in ("OFF", "SYSTEM_DEFAULT")
+    )
+    assert "<Tag>ros_discovery_off_" in off
+    assert "10.0.0.1" not in off
+    assert default == ""
+    for one in (near, peers, off):
+        ElementTree.fromstring(one)
+    with pytest.raises(shmmap.errors.ConfigError, match=r"'NEAR' is none of SUBNET, LOCALHOST"):
+        settings({"ROS_AUTOMATIC_DISCOVERY_RANGE": "NEAR"})
 
 
 # --- parameters ---------------------------------------------------------------------------------------
@@ -196,40 +166,3 @@ def test_values_have_their_types() -> None:
     )
     assert "not declared" in result["result"].reason
     assert parameters.reply("set_parameters_atomically", SimpleNamespace(parameters=[]))["result"].successful
-
-
-# --- recent cells -------------------------------------------------------------------------------------
-
-
-def cell(name: str, version: int, nbytes: int = 1) -> Any:
-    return SimpleNamespace(id=name, version=version, nbytes=nbytes)
-
-
-def test_cells_are_kept_for_a_moment(monkeypatch: pytest.MonkeyPatch) -> None:
-    now_s = [100.0]
-    monkeypatch.setattr("shmmap_clients.ros_bridge.map_answers.time.monotonic", lambda: now_s[0])
-    recent = RecentCells()
-    first, second = cell("a", 1), cell("b", 1)
-    assert recent.kept([first, second]) == [first, second]
-    again = recent.kept([cell("a", 1), cell("a", 2), cell("a", 1)])
-    assert again[0] is again[2] is first, "as it was kept"
-    assert again[1].version == 2
-    now_s[0] += 1.9
-    assert not recent.release_idle()
-    recent.kept([second])
-    now_s[0] += 1.9
-    assert (recent.release_idle(), len(recent)) == (False, 3), "a client has asked"
-    now_s[0] += 0.2
-    assert (recent.release_idle(), len(recent), recent.release_idle()) == (True, 0, False)
-    assert recent.kept([cell("a", 1)])[0] is not first
-
-
-def test_few_bytes_are_kept_and_the_newest() -> None:
-    recent = RecentCells()
-    large = [cell("abc"[n], 1, 30 << 20) for n in range(3)]
-    assert recent.kept(large) == large, "an answer has all of them"
-    assert len(recent) == 2
-    assert recent.kept([cell("c", 1), cell("b", 1)]) == [large[2], large[1]]
-    huge = cell("h", 1, 100 << 20)
-    assert recent.kept([huge]) == [huge]
-    assert len(recent) == 0

@@ -1,5 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A published map on a real Ceph whose daemons are killed; run with ``SHMMAP_TEST_CEPH=1`` as root."""
+"""A published map on a real Ceph whose daemons are killed; run with ``SHMMAP_TEST_CEPH=1`` as root.
+
+With it tests of other files that use a bucket run on Ceph, too (Debian's ``ceph-mon ceph-osd ceph-mgr radosgw
+ceph-common``)::
+
+    SHMMAP_TEST_CEPH=1 pytest --all -n 0 tests/process/slow/test_ceph.py tests/process/slow/test_publish.py \
+        tests/process/test_signed_map.py tests/process/slow/test_serving_published.py \
+        tests/unit/origin/remote/test_store.py
+"""
 
 from __future__ import annotations
 

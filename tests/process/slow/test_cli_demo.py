@@ -26,6 +26,7 @@ from shmmap.errors import BadRequest, InternalError
 from shmmap.simulation.town import Town
 from tests.support.daemon_process import DaemonProcess, Deadline, processes_marked, wait_ended
 from tests.support.demo_process import SMALL, Demo, until
+from tests.support.pictures import png_pixels
 
 
 def test_demo_measures_and_draws(tmp_path: Path) -> None:
@@ -34,7 +35,16 @@ def test_demo_measures_and_draws(tmp_path: Path) -> None:
     out, err = demo.process.communicate()
     assert (demo.process.returncode, err) == (0, "")
     report = json.loads(out)
-    assert sorted(report) == ["localization", "one_more_bytes", "outage", "rounds", "seconds", "svg", "town"]
+    assert sorted(report) == [
+        "localization",
+        "one_more_bytes",
+        "outage",
+        "png",
+        "rounds",
+        "seconds",
+        "svg",
+        "town",
+    ]
     town = report["town"]
     files = list((tmp_path / "town" / "pointcloud_map.pcd").glob("*.pcd"))
     assert town["cells"] == len(files) == 320
@@ -63,8 +73,10 @@ def test_demo_measures_and_draws(tmp_path: Path) -> None:
     squares = [e.get("class") or "" for e in picture.iter("{http://www.w3.org/2000/svg}rect")]
     assert sum(square.startswith("cell") for square in squares) >= 320
     assert shared["cells"] <= sum(square == "cell resident" for square in squares)
+    assert report["png"] == str(tmp_path / "picture.png")
+    assert png_pixels((tmp_path / "picture.png").read_bytes(), "RGB").shape == (800, 1280, 3)
     assert demo.leftovers() == []
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["picture.svg", "tmp", "town"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["picture.png", "picture.svg", "tmp", "town"]
 
 
 def _check_round(count: int, shared: dict[str, float], private: dict[str, float]) -> None:
@@ -162,7 +174,9 @@ def test_an_occupied_directory_is_refused_before_anything_is_built(tmp_path: Pat
     assert [path.name for path in (tmp_path / "town").iterdir()] == ["mine"]
 
 
-def test_the_full_demonstration_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_the_demonstration_did_before_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["demo", "--live"]) == 2
+    assert "python3 clients/examples/live_drive.py" in capsys.readouterr().err
     assert cli.main(["demo", "--full"]) == 2
     said = " ".join(capsys.readouterr().err.split())
     assert "--full" in said

@@ -21,6 +21,7 @@ from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import ROOT, DaemonProcess, LineProcess, until
 from tests.support.divided_map import DividedMap
 from tests.support.mapping_process import MappingProcess
+from tests.support.namespaces import namespaces_or_skip
 from tests.support.raw_client import RawClient, circle
 
 Connect = Callable[..., RawClient]
@@ -50,20 +51,6 @@ except shmmap.ShmmapError as error:
     print(json.dumps({"error": str(error)}), flush=True)
 sys.stdin.read()
 """
-
-
-def namespaces_or_skip(*flags: str) -> list[str]:
-    """Return the command that makes these namespaces; the test is skipped where they are refused."""
-    command = ["unshare", *flags, "--fork", "--kill-child"]
-    try:
-        done = subprocess.run(
-            [*command, "mount", "-t", "tmpfs", "tmpfs", "/mnt"], capture_output=True, text=True
-        )
-    except FileNotFoundError:
-        pytest.skip("there is no unshare")
-    if done.returncode:
-        pytest.skip(f"namespaces are refused: {done.stderr.strip()}")
-    return command
 
 
 @contextmanager

@@ -42,8 +42,8 @@ def a_directory(path: Path) -> None:
 @pytest.fixture
 def kernels(tmp_path: Path) -> Path:
     """Return a copy of the kernels that all tests use."""
-    for module in (applying_kernels, marking_kernels):
-        assert module.__all__, "they are compiled when one of them is looked for"
+    # they are compiled when one of them is looked for
+    assert all((applying_kernels.touched_bricks, marking_kernels.mark_ends))
     compile_kernels()
     used = kernel_cache.kernel_directory()
     assert used is not None
@@ -148,7 +148,8 @@ def test_who_waits_for_a_layer_learns_that_kernels_are_compiled(
     one = daemon(divided_map.root, environment={"NUMBA_CACHE_DIR": str(kernels)})
     query = partial(Shmmap(one, tmp_path).run, "query", "--circle", "0,0,5", "--layer", "ndt(leaf=2.0)")
     line = "shmmap: the daemon compiles kernels for this layer, once for this version\n"
-    assert query("--wait", "300").stderr == line  # on a busy machine a load may have come to its deadline
+    # how far the daemon is stands beside it; on a busy machine a load may have come to its deadline
+    assert query("--wait", "300").stderr.count(line) == 1
     until(lambda: not query("--wait", "300").returncode, lambda: one.log)
     assert query("--wait", "300").stderr == ""
 

@@ -209,6 +209,9 @@ def test_from_a_las_file_to_a_served_map(newcomer: Newcomer) -> None:
         assert counted is not None
         assert int(counted[1].replace(",", "")) > 1000
         assert "around.pcd" in export
+        of_file, of_daemon = (another.run(command) for command in page.commands("view"))
+        assert "wrote city.png: 60,000 points of 1 file" in of_file
+        assert "wrote place.png: " in of_daemon
     assert (newcomer.clone / "around.pcd").stat().st_size > 10_000
 
 

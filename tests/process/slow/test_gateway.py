@@ -16,7 +16,7 @@ import pytest
 import shmmap
 from tests.process.conftest import DaemonFactory
 from tests.support.command_line import publish
-from tests.support.daemon_process import first_answer
+from tests.support.daemon_process import ROOT, first_answer
 from tests.support.divided_map import make_map
 from tests.support.pages import read_page
 from tests.support.published_daemon import ALL, all_cells
@@ -26,6 +26,7 @@ pytest.importorskip("zstandard", reason="zstandard is not installed")
 pytest.importorskip("obstore", reason="obstore is not installed")
 
 PAGE = read_page("shmmap/publishing/GATEWAY.md")
+CONFIGURATION = PAGE.path.with_name("gateway.nginx.conf")
 ASKERS = 16
 
 
@@ -40,8 +41,8 @@ def origin(tmp_path: Path) -> Iterator[FaultyWeb]:
 
 
 def configured(origin: FaultyWeb, folder: Path, port: int) -> str:
-    """The page's configuration, with this machine's places and ports; nothing else is changed."""
-    text = "\n".join(PAGE.blocks["nginx"]) + "\n"
+    """The configuration, with this machine's places and ports; nothing else is changed."""
+    text = CONFIGURATION.read_text(encoding="utf-8")
     for there, here, times in (
         ("https://maps.example.org;", f"{origin.url};", 2),
         ("listen 8080;", f"listen 127.0.0.1:{port};", 1),
@@ -67,6 +68,7 @@ def gateway(origin: FaultyWeb, tmp_path: Path) -> Iterator[Nginx]:
 
 def test_the_configuration_is_one(gateway: Nginx) -> None:
     assert "nginx -t" in PAGE.commands("start")
+    assert f"cp {CONFIGURATION.relative_to(ROOT)} /etc/nginx/nginx.conf" in PAGE.commands("start")
     done = subprocess.run([*gateway.command, "-t"], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     (serve,) = PAGE.commands("serve")

@@ -107,6 +107,13 @@ def holdings(one: DaemonProcess) -> tuple[int, int, int]:
     return len(os.listdir("/proc/self/fd")), maps.count(one.shm_dir), len(threads())
 
 
+def lock_of(client: shmmap.Client) -> threading.Lock:
+    """Return what a client's thread holds while it uses the socket."""
+    connection = client.session._connection
+    assert connection is not None
+    return connection._exchange.lock
+
+
 def interrupted_everywhere(work: Callable[[], object], check: Callable[[int], None]) -> int:
     """Repeat the work, each time interrupted at the next place; returns the number of places."""
     number, tracing = 0, sys.gettrace()
@@ -135,7 +142,7 @@ def test_a_request_that_attaches(standing: DaemonProcess) -> None:
         before = holdings(standing)
 
         def check(number: int) -> None:
-            assert not client.session._lock.locked(), number
+            until(lambda: not lock_of(client).locked())  # the thread has it for moments
             if number % 8 == 0:
                 assert holdings(standing) == before, number
             assert {cell.version for cell in client.around(10, 10, 1)} == expected, number
@@ -268,7 +275,7 @@ def test_a_signal_while_libzmq_ends(standing: DaemonProcess, what: str) -> None:
         client = shmmap.connect(standing.endpoint, timeout=LONG_S)
         connection = client.session._connection
         assert connection is not None
-        return client.close, connection._socket
+        return client.close, connection._exchange.socket
 
     known = threads()
     made()[0]()
@@ -321,7 +328,7 @@ def test_a_client_in_a_handler_that_interrupted_it(standing: DaemonProcess, use:
             standing.send(signal.SIGSTOP)
 
             def interrupt() -> None:
-                while not client.session._lock.locked():
+                while not lock_of(client).locked():
                     pass
                 os.kill(os.getpid(), signal.SIGUSR1)
                 waiting.set()

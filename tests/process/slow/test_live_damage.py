@@ -7,7 +7,6 @@ Points are served, and so are other live maps; the daemon ends when it is asked 
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import shutil
 import stat
@@ -33,7 +32,16 @@ from tests.support.daemon_process import Deadline
 from tests.support.disks import HangingDirectory
 from tests.support.divided_map import DividedMap
 from tests.support.live_drive import FILTER, RESOLUTION, Voxel, drive
-from tests.support.live_reference import LIVE_TOML, LiveDaemon, held, map_scans, reference, stored_drive
+from tests.support.live_reference import (
+    LIVE_TOML,
+    LiveDaemon,
+    held,
+    map_scans,
+    old_directory,
+    reference,
+    stored_drive,
+)
+from tests.support.stored_chunks import PAGE, change_chunk, chunk_sizes, database, largest, saved_bytes
 
 
 @dataclass(frozen=True)
@@ -47,52 +55,37 @@ class Damage:
     needs_root: bool = False
 
 
-def largest(directory: Path) -> Path:
-    return max(directory.glob("*.chunk"), key=lambda path: path.lstat().st_size)
-
-
-def instead_of_a_chunk(name: str, says: str, make: Callable[[Path], None], *, root: bool = False) -> Damage:
-    """Something else has the name of a chunk."""
+def instead(name: str, says: str, make: Callable[[Path], None], *, root: bool = False) -> Damage:
+    """Something else has the name of the database."""
 
     def do(directory: Path) -> None:
-        path = largest(directory)
-        path.rename(directory.parent / f"{directory.name}.{path.name}")
-        make(path)
+        (directory / "map.db").rename(directory.parent / f"{directory.name}.map.db")
+        make(directory / "map.db")
 
     def mend(directory: Path) -> None:
-        (kept,) = directory.parent.glob(f"{directory.name}.*.chunk")
-        path = directory / kept.name.removeprefix(f"{directory.name}.")
+        path = directory / "map.db"
         path.rmdir() if path.is_dir() and not path.is_symlink() else path.unlink()
-        kept.rename(path)
+        (directory.parent / f"{directory.name}.map.db").rename(path)
 
     return Damage(name, says, do, mend, root)
 
 
-def in_a_file(name: str, file: str, says: str, change: Callable[[bytes], bytes]) -> Damage:
-    """A file says something else; it is put back from a copy."""
-
-    def do(directory: Path) -> None:
-        shutil.copy(directory / file, directory.parent / f"{name}.{file}")
-        (directory / file).write_bytes(change((directory / file).read_bytes()))
-
-    return Damage(
-        name, says, do, lambda directory: shutil.copy(directory.parent / f"{name}.{file}", directory / file)
-    )
+def both_records(directory: Path) -> None:
+    """Neither the database nor the copy has the map's record."""
+    shutil.copytree(directory, directory.parent / f"{directory.name}.kept")
+    (directory / "map.json").write_bytes(b"{")
+    (directory / "map.db").write_bytes(bytes(8 * PAGE))
 
 
-def with_value(**values: object) -> Callable[[bytes], bytes]:
-    """``map.json`` with other values."""
-    return lambda data: json.dumps({**json.loads(data), **values}).encode()
+def as_they_were(directory: Path) -> None:
+    shutil.rmtree(directory)
+    (directory.parent / f"{directory.name}.kept").rename(directory)
 
 
-def sparse(path: Path) -> None:
-    path.touch()
-    os.truncate(path, 1 << 40)
-
-
-def sparse_map(directory: Path) -> None:
-    (directory / "map.json").rename(directory.parent / "sparse.map.json")
-    sparse(directory / "map.json")
+def other_settings(directory: Path) -> None:
+    shutil.copytree(directory, directory.parent / f"{directory.name}.kept")
+    with database(directory) as opened:
+        opened.execute("update map set record = replace(record, '0.2', '0.3')")
 
 
 def a_file_instead(directory: Path) -> None:
@@ -107,27 +100,21 @@ def the_directory_again(directory: Path) -> None:
 
 DEVICE = stat.S_IFCHR | 0o600
 DAMAGES = [
-    instead_of_a_chunk("directory", "it is a directory", lambda path: path.mkdir()),
-    instead_of_a_chunk("pipe", "it is a pipe", os.mkfifo),
-    instead_of_a_chunk("loop", "it is a symbolic link", lambda path: path.symlink_to(path.name)),
-    instead_of_a_chunk("zeros", "a device", lambda path: os.mknod(path, DEVICE, os.makedev(1, 5)), root=True),
-    in_a_file("negative", "map.json", "damaged", with_value(lives=-7)),
-    in_a_file("future", "map.json", "damaged", with_value(lives=1 << 62)),
-    in_a_file("wrong_type", "map.json", "damaged", with_value(mappers=7)),
-    in_a_file("deep", "map.json", "damaged", lambda _data: b"[" * 200_000),
-    in_a_file("bit", "map.json", "damaged", lambda data: data[:9] + bytes([data[9] | 128]) + data[10:]),
-    in_a_file("two", "map.json", "two mappers have one number", with_value(
-        next_mapper=9, mappers=[{"number": 3, "uid": 0, "name": name} for name in "ab"]
-    )),
-    in_a_file("other", "map.json", "was made with", lambda data: data.replace(b"0.2", b"0.3")),
+    instead("directory", "it is a directory", lambda path: path.mkdir()),
+    instead("pipe", "it is a pipe", os.mkfifo),
+    instead("loop", "it is a symbolic link", lambda path: path.symlink_to(path.name)),
+    instead("zeros", "a device", lambda path: os.mknod(path, DEVICE, os.makedev(1, 5)), root=True),
     Damage(
-        "sparse", "more than", sparse_map,
-        lambda path: (path.parent / "sparse.map.json").replace(path / "map.json"),
+        "gone", "the database with the chunks is missing",
+        lambda path: (path / "map.db").rename(path.parent / "gone.map.db"),
+        lambda path: (path.parent / "gone.map.db").rename(path / "map.db"),
     ),
+    Damage("record", "so is the copy of its record", both_records, as_they_were),
+    Damage("other", "was made with", other_settings, as_they_were),
     Damage("file", "Not a directory", a_file_instead, the_directory_again),
     Damage(
-        "closed", "Permission denied", lambda path: os.chmod(largest(path), 0),
-        lambda path: os.chmod(largest(path), 0o600),
+        "closed", "cannot be", lambda path: os.chmod(path / "map.db", 0),
+        lambda path: os.chmod(path / "map.db", 0o600),
     ),
 ]  # fmt: skip
 
@@ -197,28 +184,22 @@ def test_each_damage_is_one_map_s_problem_until_it_is_mended(
 
 
 def damaged_body(directory: Path) -> None:
-    path = largest(directory)
-    data = bytearray(path.read_bytes())
-    data[-1] ^= 1
-    path.write_bytes(data)
+    change_chunk(directory, largest(directory), lambda data: data[:-1] + bytes([data[-1] ^ 1]))
 
 
 def damaged_header(directory: Path) -> None:
-    os.truncate(largest(directory), 50)
+    change_chunk(directory, largest(directory), lambda data: data[:50])
 
 
 def of_another(directory: Path) -> None:
-    path = largest(directory)
-    others = (one for one in directory.glob("*.chunk") if one != path)
-    shutil.copy(next(others), path)
+    other = saved_bytes(directory, next(iter(chunk_sizes(directory))))
+    change_chunk(directory, largest(directory), lambda _data: other)
 
 
 LOSSES: dict[str, Callable[[Path], object]] = {
-    "body": damaged_body, "header": damaged_header, "other": of_another,
-    "gone": lambda directory: largest(directory).unlink(), "late": damaged_body,
-    "vanished": lambda directory: largest(directory).unlink(),
+    "body": damaged_body, "header": damaged_header, "other": of_another, "late": damaged_body,
 }  # fmt: skip
-WHILE_RUNNING = {"late", "vanished"}
+WHILE_RUNNING = {"late"}
 
 
 def test_what_is_lost_is_named_by_every_verb_and_every_reader(
@@ -226,7 +207,7 @@ def test_what_is_lost_is_named_by_every_verb_and_every_reader(
 ) -> None:
     """No voxel is missing in silence, until the loss is forgotten on purpose."""
     voxels = stored_drive(tmp_path / "good", 2)
-    lost = ChunkKey.from_text(largest(tmp_path / "good").name.removesuffix(".chunk"))
+    lost = largest(tmp_path / "good")
     left = {voxel: value for voxel, value in voxels.items() if ChunkKey(*(i >> 6 for i in voxel)) != lost}
     for name, damage in LOSSES.items():
         shutil.copytree(tmp_path / "good", tmp_path / name)
@@ -265,7 +246,7 @@ def test_what_is_lost_is_named_by_every_verb_and_every_reader(
         assert (finding["state"], f"{len(LOSSES)} (" in finding["fact"]) == ("warn", True), finding
         for name in LOSSES:
             found = shmmap_verb.json("live", "fsck", "--read-only", str(tmp_path / name), code=65)
-            assert [one["chunk"] for one in found["missing"]] == [lost.text], name
+            assert [one["chunk"] for one in found["lost"]] == [lost.text], name
             done = shmmap_verb.run(
                 "live", "export", str(tmp_path / name), "-o", "out.ply", "--voxels", "both", "--force"
             )
@@ -294,6 +275,17 @@ def test_what_is_lost_is_named_by_every_verb_and_every_reader(
         for name in LOSSES:
             assert held(client.live(name)) == left
     assert health(served)[0] == 0
+    assert served.stop() == 0
+
+
+def test_a_map_of_an_earlier_version_is_imported_at_the_start(daemon: DaemonFactory, tmp_path: Path) -> None:
+    """Without a question; what was there is kept."""
+    voxels = old_directory(tmp_path / "lidar", 2)
+    served = daemon("", "--config", str(settings(tmp_path, "lidar")), "--live-budget", "16M")
+    with shmmap.connect(served.endpoint, timeout=60.0) as client:
+        assert held(client.live("lidar")) == held(client.live("lidar"), "disk") == voxels
+    assert (tmp_path / "lidar" / "imported.1" / "map.json").exists()
+    assert "imported and kept" in served.log
     assert served.stop() == 0
 
 
@@ -370,9 +362,9 @@ def test_a_full_disk_at_the_start_and_at_the_end(
     daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path, private_tmpfs: Callable[[str], str]
 ) -> None:
     """The map is opened when there is room; what is not saved at the end is named, and there afterwards."""
-    disk, scans = Path(private_tmpfs("64k")), drive()
+    disk, scans = Path(private_tmpfs("192k")), drive()
     filler = disk / "filler"
-    filler.write_bytes(bytes((64 << 10) - os.sysconf("SC_PAGESIZE")))
+    filler.write_bytes(bytes((192 << 10) - os.sysconf("SC_PAGESIZE")))
     with contextlib.suppress(OSError), filler.open("ab") as file:
         file.write(bytes(1 << 20))
     (tmp_path / "full").symlink_to(disk)
@@ -404,7 +396,7 @@ def test_a_mapper_says_that_the_disk_is_full_and_goes_on_when_there_is_room(
     live_daemon: LiveDaemon, tmp_path: Path, private_tmpfs: Callable[[str], str]
 ) -> None:
     """What the daemon knows is in the mapper's and the reader's error; nothing that was taken is lost."""
-    disk, scans = Path(private_tmpfs("128k")), drive(40)
+    disk, scans = Path(private_tmpfs("256k")), drive(40)
     (tmp_path / "lidar").symlink_to(disk)
     one = live_daemon("--live-budget", "4M", resolution=0.05)
     taken: list[int] = []

@@ -12,7 +12,7 @@ import pytest
 
 from tests.process.conftest import DaemonFactory
 from tests.support.forked_programs import run_verb
-from tests.support.ndt_programs import TownDrive, make_town_drive
+from tests.support.ndt_programs import TownDrive, town_drive_once
 from tests.support.opencl_device import need_device
 
 NDT = "shmmap_clients.ndt_scan_matcher"
@@ -26,7 +26,7 @@ def device() -> None:
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> TownDrive:
-    return make_town_drive(tmp_path_factory.mktemp("drive"), blocks=(2, 2), density=5.0, frames=12, step=2.0)
+    return town_drive_once(tmp_path_factory, blocks=(2, 2), density=5.0, frames=12, step=2.0)
 
 
 def run(module: str, *words: str) -> tuple[int, Any, str]:

@@ -82,7 +82,8 @@ def test_three_processes_at_once(tmp_path: Path) -> None:
         hits, damaged = map(int, out.split())
         assert hits > 20
         assert damaged == 0
-    assert LIMIT / 2 < check(tmp_path) <= LIMIT * 17 / 16
+    # each trims by what it saw: what another one removes meanwhile is not there for it
+    assert 0 < check(tmp_path) <= LIMIT * 17 / 16
     assert not list(tmp_path.rglob(".new-*"))
 
 

@@ -30,15 +30,15 @@ def test_a_client_of_1_x_is_refused_and_stays_connected(
 ) -> None:
     client = PlainClient(daemon(divided_map.root).endpoint)
     client.send_frame(HELLO_OF_1_5)
-    said = "client speaks protocol 1.5, daemon 2.0"
+    said = "client speaks protocol 1.5, daemon 2.2"
     assert client.message() == ["error", 7, "protocol_mismatch", said, "update the client, and restart it"]
     assert client.hello()[0] == "welcome"
     client.close()
 
 
 def test_a_daemon_of_1_x_is_named(shmmap: Verbs, short_path: Path) -> None:
-    """It answers a hello of 2.0 as 1.5 did: an error whose elements have not changed since."""
-    path, said = short_path / "old.sock", "client speaks protocol 2.0, daemon 1.5"
+    """It answers a hello of 2.2 as 1.5 did: an error whose elements have not changed since."""
+    path, said = short_path / "old.sock", "client speaks protocol 2.2, daemon 1.5"
     asked: list[Any] = []
 
     def refuse() -> None:
@@ -68,7 +68,7 @@ def test_a_daemon_of_1_x_is_named(shmmap: Verbs, short_path: Path) -> None:
     finally:
         context.term()
         daemon.join()
-    assert {(tag, *version) for tag, version in asked} == {("hello", 2, 0)}
+    assert {(tag, *version) for tag, version in asked} == {("hello", 2, 2)}
     assert said in stop
     assert f"a signal ends a daemon of any version: kill {os.getpid()}" in stop
     for text in printed:
@@ -79,7 +79,7 @@ def test_a_daemon_of_1_x_is_named(shmmap: Verbs, short_path: Path) -> None:
 def test_statistics_of_an_older_daemon_are_named(
     daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path
 ) -> None:
-    """A reader does not take what 1.x left for rows of 2.0; a daemon that starts replaces it."""
+    """A reader does not take what 1.x left for its own; a daemon that starts replaces it."""
     one = daemon(divided_map.root, start=False)
     shmmap = Shmmap(one, tmp_path)
     header = struct.pack("<8sHHI12I", b"SHMSTAT\x01", 1, 5, 0x01020304, 128, 0, 160, *[4096] * 9)
@@ -88,7 +88,7 @@ def test_statistics_of_an_older_daemon_are_named(
     for verb in ("status", "ls", "health"):
         done = shmmap.run(verb)
         assert (done.returncode, done.stdout) == (65, "")
-        assert "statistics 1.5 of an older daemon: this program reads 2.x" in done.stderr
+        assert "statistics 1.5 of an older daemon: this program reads 3.x" in done.stderr
         assert "update the daemon" in done.stderr
     one.start()
     assert shmmap.json("status")["state"] == "healthy"

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import shmmap
-from shmmap.statistics.reader import read_statistics
 from tests.process.conftest import DaemonFactory
 from tests.support.command_line import publish
 from tests.support.daemon_process import DaemonProcess, Deadline, counters, until
@@ -43,7 +42,8 @@ def web(tmp_path: Path) -> Iterator[FaultyWeb]:
 
 
 def in_memory(one: DaemonProcess) -> set[str]:
-    return {row.id for row in read_statistics(one.instance, one.shm_dir).cells}
+    with shmmap.connect(one.endpoint) as client:
+        return {row.id for row in client.list_cells()}
 
 
 def until_in_memory(one: DaemonProcess, *names: str) -> None:

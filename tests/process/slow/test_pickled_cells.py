@@ -33,6 +33,7 @@ METHODS = ("fork", "spawn", "forkserver")
 EXAMPLES = {
     "pool": r"32 cells, the highest point at \d+\.\d+ m",
     "ask": r"\[\d+, \d+, \d+\]",
+    "together": r"\{-40: \d+, 0: \d+, 40: \d+\}",
     "keep": r"500 points of -?\d+_-?\d+\.pcd",
 }
 

@@ -18,12 +18,12 @@ from shmmap_clients.scans.scan_file import read_scan
 import shmmap
 from tests.process.conftest import DaemonFactory
 from tests.support.forked_programs import run_verb
-from tests.support.ndt_programs import TownDrive, make_town_drive
+from tests.support.ndt_programs import TownDrive, town_drive_once
 
 
 @pytest.fixture(scope="module")
 def town(tmp_path_factory: pytest.TempPathFactory) -> TownDrive:
-    return make_town_drive(tmp_path_factory.mktemp("town"), blocks=(3, 3), density=5.0, frames=5, step=15.0)
+    return town_drive_once(tmp_path_factory, blocks=(3, 3), density=5.0, frames=5, step=15.0)
 
 
 @pytest.fixture

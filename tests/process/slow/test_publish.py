@@ -25,6 +25,7 @@ from shmmap.origin.remote.opened_store import open_store
 from shmmap.progress import NoProgress
 from tests.support.accounts import OTHER_USER
 from tests.support.command_line import Verbs, files_of, locked, make_older
+from tests.support.compiled_programs import made_once
 from tests.support.divided_map import DividedMap, make_map
 from tests.support.map_stores import BucketServer
 from tests.support.published_daemon import without
@@ -44,7 +45,11 @@ def town(tmp_path: Path) -> DividedMap:
 @pytest.fixture(scope="session")
 def _stores(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Where the town is published, and where two more versions of it are."""
-    folder = tmp_path_factory.mktemp("published")
+    folder = made_once(tmp_path_factory, "published_versions", _publish_versions)
+    return folder / "one", folder / "three"
+
+
+def _publish_versions(folder: Path) -> None:
     made = make_map(folder / "town", columns=2, rows=2, points=300)
     run = Verbs(folder)
     run("publish", made.root, folder / "one", "--id-prefix", "/store/")
@@ -52,7 +57,6 @@ def _stores(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     for seed in (1, 2):
         made.change("0_0.pcd", seed)
         run("publish", made.root, folder / "three")
-    return folder / "one", folder / "three"
 
 
 @pytest.fixture

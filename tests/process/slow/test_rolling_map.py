@@ -159,7 +159,7 @@ def test_a_drive_from_files(live_daemon: LiveDaemon, words: Words, tmp_path: Pat
     assert len(lines) == 6
     assert lines[0].startswith("scan_0: 150 points, ")
     assert " too low or high; " in lines[0]
-    assert lines[0].partition(" active cells, ")[2].endswith(" chunks") or "waiting" in lines[0]
+    assert lines[0].partition(" voxels known, ")[2].endswith(" chunks") or "waiting" in lines[0]
 
 
 def test_the_summary_in_words_and_numbers_that_rise(live_daemon: LiveDaemon, words: Words) -> None:
@@ -169,7 +169,7 @@ def test_the_summary_in_words_and_numbers_that_rise(live_daemon: LiveDaemon, wor
     assert (done.returncode, done.stderr) == (0, "")
     first, second = done.stdout.splitlines()
     assert first.startswith("3 scans, 450 points, ")
-    assert " count; left out: " in first
+    assert " of them used; left out: " in first
     assert second.startswith("live map lidar: ")
     assert second.endswith(" clean") or " saved" in second
     assert json.loads(run(*words(one, "--json", "--quiet", scans=3)).stdout)["first_scan"] == 7
@@ -240,10 +240,10 @@ def test_the_picture_shows_what_is_chosen(live_daemon: LiveDaemon, words: Words,
     one = live_daemon(checkpoint=3600.0)
     picture = tmp_path / "map.svg"
     for show, seen, unseen in (
-        ([], ["height", "clean", "active cells"], ["free"]),
-        (["--show", "free"], ["free"], ["height", "clean", "active cells"]),
-        (["--show", "occupied,free,chunks,usage"], ["height", "free", "clean", "active"], []),
-        (["--show", "usage"], ["active cells"], ["height", "free", "clean"]),
+        ([], ["height", "clean", "voxels known"], ["free"]),
+        (["--show", "free"], ["free"], ["height", "clean", "voxels known"]),
+        (["--show", "occupied,free,chunks,usage"], ["height", "free", "clean", "voxels known"], []),
+        (["--show", "usage"], ["voxels known"], ["height", "free", "clean"]),
     ):
         run(*words(one, "--picture", str(picture), "--quiet", *show, scans=3))
         text = texts(picture)

@@ -14,6 +14,9 @@ import pytest
 
 pytest.importorskip("cyclonedds", reason="needs the package cyclonedds")
 
+from cyclonedds.qos import Policy
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
 from shmmap_clients.ros_bridge.live_worker import LIVE_SERVICES
 from shmmap_clients.ros_bridge.messages import (
     DIFFERENTIAL,
@@ -24,6 +27,7 @@ from shmmap_clients.ros_bridge.messages import (
     PointCloud2,
 )
 from shmmap_clients.ros_bridge.parameters import PARAMETER_SERVICES
+from shmmap_clients.ros_bridge.type_hashes import type_hash
 
 from tests.process.conftest import DaemonFactory
 from tests.support.bridge_process import (
@@ -33,20 +37,11 @@ from tests.support.bridge_process import (
     built_cyclone_peer,
     built_fast_peer,
 )
-from tests.support.daemon_process import DaemonProcess
+from tests.support.daemon_process import DaemonProcess, until
 from tests.support.divided_map import DividedMap
 from tests.support.pages import read_page
-from tests.support.ros_peer import (
-    KINDS,
-    NAMES,
-    Reply,
-    RosPeer,
-    asked,
-    expected,
-    from_lines,
-    from_message,
-    reload,
-)
+from tests.support.ros.replies import Reply, expected, from_lines, from_message, path_of
+from tests.support.ros_peer import KINDS, NAMES, RosPeer, asked, reload, service_qos
 
 Ask = Callable[..., Reply]
 
@@ -92,14 +87,40 @@ def test_three_services_to_the_byte(ask: Ask, divided_map: DividedMap) -> None:
         divided_map, lambda box: box[0] - 15 <= 3 <= box[2] + 15 and box[1] - 15 <= -4 <= box[3] + 15
     )
     assert 4 <= len(near) < len(divided_map.corners)
-    assert ask("partial", area=(3, -4, 15)) == expected(divided_map, near)
-    has = [divided_map.id(near[1]), "gone.pcd", divided_map.id("40_40.pcd"), divided_map.id(near[2])]
+    found = ask("partial", area=(3, -4, 15))
+    assert found.plain == expected(divided_map, near)
+    (far,) = ask("selected", ids=[divided_map.id("40_40.pcd")]).ids
+    has = [found.ids[1], "gone.pcd", far, found.ids[2], divided_map.id(near[3])]
     left = [name for name in near if name not in near[1:3]]
-    assert ask("differential", area=(3, -4, 15), ids=has) == expected(divided_map, left, [has[1], has[2]])
+    removed = [has[1], has[2], has[4]]
+    assert ask("differential", area=(3, -4, 15), ids=has).plain == expected(divided_map, left, removed)
     wanted = ["40_40.pcd", near[0], "40_40.pcd"]
-    ids = [divided_map.id(wanted[0]), "unknown", *map(divided_map.id, wanted[1:])]
-    assert ask("selected", ids=ids) == expected(divided_map, wanted)
+    ids = [far, "unknown", divided_map.id(near[0]), far]
+    assert ask("selected", ids=ids).plain == expected(divided_map, wanted)
     assert ask("selected", ids=[]) == expected(divided_map, [])
+
+
+def test_endpoints_have_the_hashes_of_their_types(bridge: BridgeProcess, peer: RosPeer) -> None:
+    """In their user data, where ROS reads them."""
+    client = peer.client(NAMES["partial"], PARTIAL)
+    client.wait_for_service()
+    (reader,) = client.writer.get_matched_subscriptions()
+    (writer,) = client.reader.get_matched_publications()
+    for kind, endpoint in (
+        (PARTIAL.request, client.writer.get_matched_subscription_data(reader)),
+        (PARTIAL.reply, client.reader.get_matched_publication_data(writer)),
+    ):
+        said = endpoint.qos[Policy.Userdata].data.decode()
+        assert re.fullmatch(r"serviceid=[0-9a-f.]+;" + re.escape(type_hash(kind)), said), said
+    reader = DataReader(
+        peer.participant,
+        Topic(peer.participant, "rt/map/pointcloud_map_metadata", MapMetaData),
+        service_qos(latched=True, depth=1),
+    )
+    until(reader.get_matched_publications)
+    (writer,) = reader.get_matched_publications()
+    said = reader.get_matched_publication_data(writer).qos[Policy.Userdata].data.decode()
+    assert said == type_hash(MapMetaData)
 
 
 @pytest.mark.usefixtures("bridge")
@@ -111,7 +132,8 @@ def test_areas_that_make_no_sense_are_answered_as_autoware_does(
         divided_map, lambda box: box[0] + 5 <= 10 <= box[2] - 5 and box[1] + 5 <= 10 <= box[3] - 5
     )
     assert inside == ["0_0.pcd"]
-    has = [divided_map.id("0_0.pcd"), divided_map.id("20_0.pcd"), "x"]
+    paths = [divided_map.id("0_0.pcd"), divided_map.id("20_0.pcd")]
+    has = [*asked(peer, "selected", ids=paths).ids, "x"]
     for area, names in {
         (0.0, 0.0, math.inf): everything,
         (math.nan, 0.0, 100.0): [],
@@ -119,9 +141,9 @@ def test_areas_that_make_no_sense_are_answered_as_autoware_does(
         (10.0, 10.0, -5.0): inside,
         (10.0, 10.0, -11.0): [],
     }.items():
-        assert asked(peer, "partial", area=area).ids == [divided_map.id(name) for name in names], area
+        ids = asked(peer, "partial", area=area).ids
+        assert [path_of(one) for one in ids] == [divided_map.id(name) for name in names], area
         found = asked(peer, "differential", area=area, ids=has)
-        ids = [divided_map.id(name) for name in names]
         assert found.ids == [one for one in ids if one not in has], area
         assert found.removed == [one for one in has if one not in ids], area
 
@@ -140,24 +162,43 @@ def test_points_have_the_fields_of_the_file(
     town.write_metadata()
     with BridgeProcess(daemon(town.root), dds):
         found = asked(peer, "partial", area=(20, 10, 5))
-    assert found == expected(town, ["0_0.pcd", "20_0.pcd"])
+    assert found.plain == expected(town, ["0_0.pcd", "20_0.pcd"])
     assert [cell.shape[3] for cell in found.cells] == [12, 17]
 
 
-def test_a_changed_cell_is_sent_again_to_a_client_with_the_old_one(
+def test_a_changed_cell_comes_once_to_each_client(
     bridge: BridgeProcess, served: DaemonProcess, peer: RosPeer, divided_map: DividedMap
 ) -> None:
-    first, second = (peer.client(NAMES["differential"], DIFFERENTIAL) for _ in range(2))
+    """Under a new id; over a restart of the bridge, too."""
+    clients = [peer.client(NAMES["differential"], DIFFERENTIAL) for _ in range(2)]
     area = AreaInfo(3.0, -4.0, 15.0)
-    ids = from_message(first.call(area=area, cached_ids=[])).ids
-    assert from_message(second.call(area=area, cached_ids=ids[:1])).ids == ids[1:], "an id counts as current"
-    divided_map.change(Path(ids[0]).name, seed=5)
+    ids = from_message(clients[0].call(area=area, cached_ids=[])).ids
+    file = Path(path_of(ids[0])).name
+    divided_map.change(file, seed=5)
     reload(served)
-    found = from_message(first.call(area=area, cached_ids=ids))
-    assert (found.ids, found.removed) == (ids[:1], [])
-    assert found.cells[0] == expected(divided_map, [Path(ids[0]).name]).cells[0]
-    assert from_message(first.call(area=area, cached_ids=ids)).ids == [], "once"
-    assert from_message(second.call(area=area, cached_ids=ids)).ids == ids[:1]
+    for client, restart in zip(clients, (False, True), strict=True):
+        if restart:
+            bridge.kill()
+            bridge.start()
+        found = from_message(client.call(area=area, cached_ids=ids))
+        assert found.removed == ids[:1]
+        assert found.ids != ids[:1]
+        assert found.plain.cells == expected(divided_map, [file]).cells
+        again = from_message(client.call(area=area, cached_ids=[*ids[1:], *found.ids]))
+        assert (again.ids, again.removed) == ([], []), "once"
+
+
+def test_ids_as_autoware_s(served: DaemonProcess, dds: int, peer: RosPeer, divided_map: DividedMap) -> None:
+    """Without versions, where it is asked for: then a change goes unnoticed."""
+    with BridgeProcess(served, dds, "--plain-ids"):
+        near = in_order(divided_map, lambda box: box[:2] == (0, 0))
+        assert asked(peer, "selected", ids=[divided_map.id(near[0])]) == expected(divided_map, near)
+        found = asked(peer, "partial", area=(3, -4, 15))
+        listed = peer.latched("/map/pointcloud_map_metadata", MapMetaData)
+        assert set(found.ids) < {one.cell_id for one in listed.metadata_list}
+        divided_map.change("0_0.pcd", seed=5)
+        reload(served)
+        assert asked(peer, "differential", area=(3, -4, 15), ids=[*found.ids, "x"]).removed == ["x"]
 
 
 def test_a_cell_that_cannot_be_loaded_is_left_out_and_logged(
@@ -178,7 +219,9 @@ def test_the_list_of_cells_is_latched_and_follows_the_map(
     listed = peer.latched("/map/pointcloud_map_metadata", MapMetaData)
     assert listed.header.frame_id == "map"
     assert listed.header.stamp.sec > 0
-    listed_cells = {one.cell_id: one.metadata for one in listed.metadata_list}
+    names = [one.cell_id for one in listed.metadata_list]
+    assert asked(peer, "selected", ids=names).ids == names
+    listed_cells = {path_of(one.cell_id): one.metadata for one in listed.metadata_list}
     assert list(listed_cells) == sorted(divided_map.id(name) for name in divided_map.corners)
     for name in divided_map.corners:
         box = listed_cells[divided_map.id(name)]

@@ -23,7 +23,8 @@ from tests.process.conftest import DaemonFactory
 from tests.support.bridge_process import PROGRAM, BridgeProcess, bridge_environment, built_fast_peer
 from tests.support.daemon_process import DaemonProcess, stop
 from tests.support.divided_map import DividedMap, make_map
-from tests.support.ros_peer import NAMES, RosPeer, asked, from_message, reload
+from tests.support.ros.replies import from_message, path_of
+from tests.support.ros_peer import NAMES, RosPeer, asked, reload
 
 CLIENTS = int(os.environ.get("SHMMAP_TEST_ROS_CLIENTS", "40"))
 """How many clients come and go; the full number is 1000."""
@@ -63,23 +64,26 @@ def test_clients_are_answered_again_when_the_daemon_is_back(
 def test_clients_are_answered_again_by_the_next_bridge(
     served: DaemonProcess, dds: int, peer: RosPeer, divided_map: DividedMap
 ) -> None:
-    """Killed or ended; what a client holds then counts as current, and changes are noticed from there on."""
+    """Killed or ended, while the map changes: the ids of a client say what it has."""
     client = peer.client(NAMES["differential"], DIFFERENTIAL)
     area = AreaInfo(0.0, 0.0, 15.0)
     with BridgeProcess(served, dds) as bridge:
         ids = from_message(client.call(area=area, cached_ids=[])).ids
-        for end in (bridge.kill, bridge.stop):
+        for seed, end in enumerate((bridge.kill, bridge.stop)):
             end()
+            divided_map.change(Path(path_of(ids[1])).name, seed=seed)
+            reload(served)
             bridge.start()
             number = client.send(
                 area=area, cached_ids=ids
             )  # before it is found: a client knows nothing of it
             again = client.call(area=area, cached_ids=ids)
-            assert from_message(again).ids == []
             assert again.number > number
-        divided_map.change(Path(ids[1]).name, seed=9)
-        reload(served)
-        assert from_message(client.call(area=area, cached_ids=ids)).ids == ids[1:2]
+            found = from_message(again)
+            assert found.removed == ids[1:2]
+            assert path_of(*found.ids) == path_of(ids[1])
+            ids[1:2] = found.ids
+            assert from_message(client.call(area=area, cached_ids=ids)).ids == []
 
 
 ENDED_ANYWHERE = """
@@ -107,7 +111,7 @@ def test_a_signal_may_come_at_any_place(served: DaemonProcess, dds: int) -> None
         [sys.executable, "-c", ENDED_ANYWHERE, "--endpoint", served.endpoint, "--domain", str(dds)],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=240,
         env=bridge_environment(),
     )
     assert (done.returncode, "ready:" in done.stderr) == (0, True), done.stderr
@@ -126,13 +130,13 @@ def test_clients_that_come_and_go_leave_nothing(bridge: BridgeProcess, peer: Ros
     """Each a participant of its own, that asks and leaves."""
     area = AreaInfo(0.0, 0.0, 15.0)
     asked(peer, "partial", area=(0, 0, 5))
-    bridge.wait_status(remembered=0)
+    bridge.wait_status(clients=0)
     before = threads_and_files(bridge.pid)
     for _ in range(CLIENTS):
         with peer.another() as one:
             client = one.client(NAMES["differential"], DIFFERENTIAL)
             assert client.call(area=area, cached_ids=[]).new_pointcloud_with_ids
-    bridge.wait_status(clients=0, remembered=0)
+    bridge.wait_status(clients=0)
     assert threads_and_files(bridge.pid) == before
 
 
@@ -189,11 +193,6 @@ def test_what_is_more_than_the_daemon_takes_at_once(bridge: BridgeProcess, peer:
         near = asked(peer, "partial", area=(0, 0, 5)).ids
         assert found.removed == [one for one in (*more, *known[1:]) if one not in set(near)]
         assert found.ids == [one for one in near if one == known[0]]
-    greedy = peer.client(NAMES["selected"], SELECTED)
-    greedy.wait_for_service()
-    greedy.send(cell_ids=known * 3000)
-    bridge.wait_said("not answered: 108,000 cells in one request")
-    assert asked(peer, "partial", area=(0, 0, 5)).ids == near, "while its sender still waits"
 
 
 def test_a_request_whose_cells_do_not_come_holds_up_no_other(

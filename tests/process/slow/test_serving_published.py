@@ -18,7 +18,7 @@ import pytest
 import shmmap
 from tests.process.conftest import DaemonFactory
 from tests.support.command_line import health, make_older, publish, verb
-from tests.support.compiled_programs import built_preload
+from tests.support.compiled_programs import built_preload, made_once
 from tests.support.cpp_client import CppClient
 from tests.support.daemon_process import Deadline, counters
 from tests.support.divided_map import DividedMap, make_map, random_points
@@ -52,14 +52,16 @@ Connect = Callable[..., RawClient]
 
 @pytest.fixture(scope="session")
 def _published(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("published")
+    return made_once(tmp_path_factory, "served", _publish_town)
+
+
+def _publish_town(folder: Path) -> None:
     made = make_map(folder / "town", columns=3, rows=3, points=300)
     publish(made.root, folder / "www", "--layer", NDT, "--id-prefix", "/town/")
     shutil.copytree(folder / "town", folder / "changed")
     DividedMap(folder / "changed", corners=dict(made.corners)).change("0_0.pcd", seed=5)
     shutil.copytree(folder / "www", folder / "next")
     publish(folder / "changed", folder / "next", "--layer", NDT)
-    return folder
 
 
 @pytest.fixture

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
@@ -14,10 +15,13 @@ from numpy.typing import NDArray
 
 from shmmap.client.attaching import Attacher
 from shmmap.client.cell import Access, Cell
+from shmmap.layers import LayerTable
 from shmmap.protocol.messages import Handle
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.header import PublishBlock
 from shmmap.segment.layout import SourceStamp
+from shmmap.segment.names import new_segment_name
+from shmmap.segment.writer import SegmentOrigin, write_table
 from tests.support.segments import Box, publish_segment
 
 
@@ -62,6 +66,30 @@ class Segments:
 
     def cell(self, cell_id: str, columns: dict[str, NDArray[Any]], **options: Any) -> Cell:
         return self.attach(*self.publish(cell_id, columns, **options))
+
+    def layer(self, spec: str, table: LayerTable) -> Cell:
+        """Return a cell of a computed layer."""
+        box, name, fd = (0.0, 0.0, 20.0, 20.0), new_segment_name("unit"), self.directory.create()
+        try:
+            header = write_table(
+                fd,
+                table.columns,
+                layer=spec,
+                rows=table.rows,
+                origin=SegmentOrigin("/map/a.pcd", box, "map", SourceStamp(1, 2, 3), bytes(16), 0, 0),
+                builder_version=1,
+                units=table.units,
+                lattice=table.lattice,
+                z_min=0.0,
+                z_max=1.0,
+            )
+            block = PublishBlock(epoch=7, version=1)
+            self.directory.publish(
+                fd, name, block=block, header_bytes=header.header_bytes, mode=0o400, gid=-1
+            )
+        finally:
+            os.close(fd)
+        return self.attach(name, Handle("/map/a.pcd", 1, spec, name, 0, header.total_bytes, table.rows, *box))
 
 
 @pytest.fixture

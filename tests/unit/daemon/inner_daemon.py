@@ -18,7 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from shmmap.daemon.config import DaemonConfig
-from shmmap.daemon.map_in_memory import MapInMemory
+from shmmap.daemon.loading.link import Link
+from shmmap.daemon.map_in_memory import FetchedFrom, MapInMemory
 from shmmap.daemon.pins.watch import PinWatch
 from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.daemon.requests.map_queries import MapQueries
@@ -28,13 +29,23 @@ from shmmap.daemon.transport.sessions import Session
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.map_directory import open_map
 from shmmap.protocol.codec import decode_reply
-from shmmap.protocol.messages import Area, BoxMessage, Cells, Differential, Selected
+from shmmap.protocol.messages import (
+    Area,
+    BoxMessage,
+    Cells,
+    CellsPage,
+    Differential,
+    ListCells,
+    Selected,
+)
+from shmmap.protocol.rows import CellRow
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import prepare_process
 from tests.support import connections
 from tests.support.daemon_process import stop
 
 TIMEOUT_S = 240.0
+FETCHED_BYTES = 100_000
 EVERYWHERE = BoxMessage(-1e4, -1e4, 1e4, 1e4)
 
 
@@ -50,7 +61,10 @@ def finish(work: Iterator[None] | None) -> None:
 
 
 class InnerDaemon:
-    """What the daemon has in memory, and requests over one map; ``offset_s`` moves its clock ahead."""
+    """What the daemon has in memory, and requests over one map; ``offset_s`` moves its clock ahead.
+
+    With a ``link``, each job that reads a cell uses it, although the cells are files.
+    """
 
     def __init__(
         self,
@@ -61,6 +75,7 @@ class InnerDaemon:
         workers: int = 1,
         load_timeout_s: float = 300.0,
         prefetch_share: float = 0.0,
+        link: Link | None = None,
         **settings: Any,
     ) -> None:
         prepare_process()
@@ -68,6 +83,8 @@ class InnerDaemon:
         self.directory = ShmDirectory(self.shm_dir)
         self.origin = open_map(map_path, cache_dir=cache_dir)
         values: dict[str, Any] = {"budget_bytes": 64 << 20, "outage_tolerance_s": 10.0, **settings}
+        if "prepare" in settings:
+            values["cache_dir"] = cache_dir
         config = DaemonConfig(
             map_path=map_path,
             instance="inner",
@@ -80,8 +97,9 @@ class InnerDaemon:
         self.offset_s = 0.0
         self.stopped_at_s: float | None = None
         pins = PinWatch(self.directory, events=True)
+        fetched = FetchedFrom((), 1, link, lambda job: 0 if job.points else FETCHED_BYTES) if link else None
         self.memory = memory = MapInMemory(
-            config, self.origin.load(), self.directory, pins, "", 0o400, -1, clock=self.now_s
+            config, self.origin.load(), self.directory, pins, "", 0o400, -1, None, fetched, clock=self.now_s
         )
         self.cache, self.scheduler, self.sessions = memory.cache, memory.scheduler, memory.sessions
         self.statistics, self.event_log, self.watched = memory.statistics, memory.event_log, memory.watched
@@ -155,6 +173,9 @@ class InnerDaemon:
         self.map_switch.run_step(now_s)
         if self.scheduler.prefetcher.next_s <= now_s:
             self.scheduler.prefetcher.run_step(now_s)
+        preparer = self.memory.preparer
+        if preparer is not None and preparer.next_s <= now_s:
+            preparer.run_step(now_s)
         if self.evictor.next_s <= now_s:
             self.evictor.run_step(now_s)
         while not self.hold_answers and self.due:
@@ -198,6 +219,17 @@ class InnerDaemon:
     def everything(self, request: int = 1) -> Cells:
         """Ask for all cells and wait for them."""
         return self.cells_for(Area(request, EVERYWHERE, wait=600.0))
+
+    def listed(self) -> list[CellRow]:
+        """All that is in memory, as clients list it."""
+        rows: list[CellRow] = []
+        start: int | None = 0
+        while start is not None:
+            page = self.queries.answer(ListCells(1, start))
+            assert isinstance(page, CellsPage)
+            rows += page.rows
+            start = page.next
+        return rows
 
     def path_of(self, segment: str) -> str:
         """Path of a segment that a reply names."""

@@ -16,8 +16,6 @@ from shmmap.geometry import Area
 from shmmap.origin.catalogue import Catalogue, CatalogueChange
 from shmmap.segment.version import Source, Stamp
 
-__all__ = ["MemoryPages", "PagedOrigin", "PagedView"]
-
 Indices = NDArray[np.intp]
 
 
@@ -102,6 +100,11 @@ class MemoryPages:
                 self.needed.append(page)
             else:
                 self.wanted[page] = min(priority, self.wanted.get(page, priority))
+
+    def want_nearest(self, place: tuple[float, float] | None) -> bool:
+        """Fetch nothing that nothing needs."""
+        del place
+        return False
 
     def collect(self) -> PageNews:
         os.eventfd_read(self.fd)

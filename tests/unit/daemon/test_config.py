@@ -162,6 +162,47 @@ def test_quotas_are_parts_or_bytes(quota: str | int, value: float) -> None:
     assert load({"session_quota": quota}).session_quota == value
 
 
+@pytest.mark.parametrize(
+    ("flags", "environ"),
+    [
+        ({"prepare": ["ndt(2)", "voxel(leaf=1, of=voxel(leaf=0.5))"]}, {}),
+        (
+            {},
+            {"SHMMAP_PREPARE": " ndt( leaf = 2.0, min_points=6 ), voxel(leaf=1, of=voxel(leaf=0.5)),ndt(2)"},
+        ),
+    ],
+)
+def test_layers_to_prepare_are_a_list(flags: dict[str, Any], environ: dict[str, str], tmp_path: Path) -> None:
+    wanted = ("ndt(leaf=2.0)", "voxel(leaf=1.0,of=voxel(leaf=0.5))")
+    assert load(flags, environ).prepare == wanted
+    file = tmp_path / "shmmap.toml"
+    file.write_text("prepare = ['ndt(2)', 'voxel(leaf=1, of=voxel(leaf=0.5))']\n")
+    assert load(file=str(file)).prepare == wanted
+
+
+@pytest.mark.parametrize(
+    ("text", "message", "hint"),
+    [
+        ("prepare = ['ndt(leaf=2.0', 'voxel(leaf=1)']", ":1: prepare: ", ""),
+        ("prepare = ['ntd(leaf=2.0)']", ":1: prepare: unknown layer 'ntd'", "did you mean 'ndt'?"),
+        ("prepare = ['ndt']", ":1: prepare: ndt needs leaf", "leaf"),
+        ("prepare = 3", ":1: prepare must be a list of texts, not 3", "its default is []"),
+        ("prepare = [3]", ":1: prepare must be a list of texts, not [3]", "its default is []"),
+        ("cache_size = '0'\nprepare = ['ndt(2)']", "and cache_size is 0", "name a cache_size"),
+    ],
+)
+def test_layers_that_cannot_be_prepared_are_refused(
+    tmp_path: Path, text: str, message: str, hint: str
+) -> None:
+    file = tmp_path / "shmmap.toml"
+    file.write_text(text)
+    with pytest.raises(ConfigError) as failure:
+        load(file=str(file))
+    assert message in failure.value.message
+    assert str(file) in failure.value.message
+    assert (failure.value.key, hint in failure.value.hint) == ("prepare", True)
+
+
 def test_a_processor_is_left_for_the_loop(monkeypatch: pytest.MonkeyPatch) -> None:
     for processors, loaders in ((1, 1), (2, 1), (4, 3), (64, 4)):
         monkeypatch.setattr(os, "sched_getaffinity", lambda _pid, count=processors: set(range(count)))

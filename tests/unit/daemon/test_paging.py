@@ -366,9 +366,11 @@ def test_a_page_goes_when_nothing_needs_it_and_no_sooner(paged: Paged) -> None:
     paged.pages.most = 1
     assert paged.paging.is_needed(WEST), "a session's area"
     assert paged.paging.is_needed(EAST), "a segment"
+    paged.pages.most = 2  # only cells of pages in memory can be pinned
     assert isinstance(paged.ask(lambda n: m.Evict(n, ("20_20.pcd",))), m.Evicted)
     daemon.turn_until(lambda: not cache.ledger.retired)
     assert isinstance(paged.ask(lambda n: m.Pin(n, ("20_0.pcd",))), m.Pinned)
+    paged.pages.most = 1
     assert paged.paging.is_needed(EAST), "a pin"
     paged.ask(m.Unpin)
     daemon.turn_until(lambda: not daemon.memory.scheduler.loads.by_key)

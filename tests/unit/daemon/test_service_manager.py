@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import socket
@@ -29,8 +30,9 @@ from shmmap.errors import ConfigError
 class Sent(list[tuple[str, ...]]):
     """All lines that were sent."""
 
-    def send(self, *lines: str) -> None:
+    def send(self, *lines: str) -> bool:
         self.append(lines)
+        return True
 
 
 def manager(environ: dict[str, str] | None = None) -> tuple[ServiceManager, Sent]:
@@ -104,6 +106,40 @@ def test_notify(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, abstract: bool)
         assert manager.recv(100) == b"READY=1\nSTATUS=serving 5 cells of a MAINPID=1"
 
 
+def test_a_manager_that_reads_nothing_holds_nothing_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its queue takes a few datagrams; what changed the state is sent once it reads again, in order."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as reader:
+        reader.bind(f"{tmp_path}/notify")
+        reader.setblocking(False)
+        monkeypatch.setenv("NOTIFY_SOCKET", f"{tmp_path}/notify")
+        one = ServiceManager({"WATCHDOG_USEC": "3000000"})
+        one.ready("serving")
+        for second in range(10_000):
+            one.beat(float(second), lambda second=second: f"at {second}")  # type: ignore[misc]
+        for number in range(20):
+            one.reloading()
+            one.reloaded(f"reload {number}")
+
+        def read() -> list[bytes]:
+            found = []
+            with contextlib.suppress(BlockingIOError):
+                while True:
+                    found.append(reader.recv(200))
+            return found
+
+        before = read()
+        assert before[0].startswith(b"READY=1\nSTATUS=serving\n")
+        assert len(before) < 2000
+        after: list[bytes] = []
+        for _ in range(20):
+            one.beat(20_000.0, lambda: "now")
+            after += read()
+        assert len(after) == 10
+        assert after[-3:] == [b"READY=1\nSTATUS=reload 19", b"WATCHDOG=1", b"STATUS=now"]
+
+
 @pytest.mark.parametrize("address", ["", "/nowhere/notify", "@no-such-socket", "relative", "@" + "x" * 300])
 def test_no_service_manager_listens(monkeypatch: pytest.MonkeyPatch, address: str) -> None:
     monkeypatch.setenv("NOTIFY_SOCKET", address)
@@ -116,10 +152,11 @@ def test_it_asks_while_it_lasts() -> None:
     sent: list[tuple[str, ...]] = []
     twice = threading.Event()
 
-    def send(*lines: str) -> None:
+    def send(*lines: str) -> bool:
         sent.append(lines)
         if len(sent) == 2:
             twice.set()
+        return True
 
     with MoreTime(send, "reading the map", every_s=0.0):
         assert twice.wait(60.0)
@@ -132,8 +169,8 @@ def test_it_asks_while_it_lasts() -> None:
 
 def test_what_hangs_gets_no_more_in_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shmmap.daemon.service_manager.MAX_START_S", -1.0)
-    sent: list[tuple[str, ...]] = []
-    one = MoreTime(lambda *lines: sent.append(lines), "reading the map", every_s=0.0)
+    sent = Sent()
+    one = MoreTime(sent.send, "reading the map", every_s=0.0)
     with one:
         one._thread.join(60.0)
         assert not one._thread.is_alive()

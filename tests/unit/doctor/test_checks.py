@@ -325,7 +325,8 @@ LIDAR = LiveMapRow(
 def with_live(*rows: LiveMapRow, clients: Sequence[ClientRow] = (), **counters: int) -> Snapshot:
     """A daemon that keeps these live maps, and accepts no connection."""
     seen = snapshot("hung")
-    seen.__dict__ |= {"counters": counters, "live": list(rows), "clients": list(clients)}
+    seen.__dict__["counters"] = counters
+    seen.live, seen.clients = rows, clients
     return seen
 
 
@@ -341,12 +342,21 @@ def test_without_live_maps_there_is_nothing_to_look_at(ward: Ward) -> None:
             assert check(diagnosis).skipped, check
 
 
+def test_live_maps_of_a_daemon_that_does_not_answer(ward: Ward) -> None:
+    seen = snapshot("stopped")
+    assert seen.identity is not None
+    seen.identity = dataclasses.replace(seen.identity, live="lidar radar")
+    found = live.check_live_maps(ward.diagnosis(seen))
+    assert (found.skipped, found.fact) == (True, "lidar, radar: the daemon does not answer")
+    assert access.check_map_access(ward.diagnosis(seen, map_path="")).state == "ok"
+
+
 @pytest.mark.parametrize(
     ("row", "restarts", "state", "fact"),
     [
         (LIDAR, 0, "ok", "lidar: 4 chunks not saved yet"),
         (LIDAR, 2, "warn", "the process that keeps them ended 2 times"),
-        (replace(LIDAR, damaged_count=2), 2, "warn", "damaged files, missing chunks: 2"),
+        (replace(LIDAR, damaged_count=2), 2, "warn", "lost chunks, damaged databases: 2"),
         (
             replace(LIDAR, damaged_count=2, problem="chunk 0_0_0 cannot be saved: full"),
             0,
@@ -476,13 +486,12 @@ def test_readers_that_keep_chunks_are_named(ward: Ward) -> None:
     assert check().fact.endswith("; and 1 more")
 
 
-def test_readers_whose_requests_take_much_time_are_named(ward: Ward, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_readers_whose_requests_take_much_time_are_named(ward: Ward) -> None:
     marks(ward)
     clients = [ClientRow(3, 4242, 0, 0, "perception", "python3", 0, 0, 0, 0)]
     busiest = ((3, 730), (9, 500), (5, 499))
     row = replace(LIDAR, readers=busiest)
-    monkeypatch.setattr(live, "_reported", lambda _diagnosis: (row,))
-    found = live.check_live_memory(ward.diagnosis(with_live(LIDAR, clients=clients)))
+    found = live.check_live_memory(ward.diagnosis(with_live(row, clients=clients)))
     assert found.state == "warn"
     assert found.fact.endswith("perception, pid 4242: 73 % for lidar; session 9: 50 % for lidar")
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import builtins
 import os
 import platform
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -20,7 +21,7 @@ from shmmap.formats.cloud import describe, read_cloud, read_pcd
 from shmmap.formats.pcd.writer import write_pcd
 from shmmap.formats.source_file import CAUSES
 from shmmap.open3d_loading import SYSTEM_PACKAGES, load_open3d
-from tests.support.cloud_bytes import Field, column, pcd, write_las
+from tests.support.cloud_bytes import Field, column, las_file, pcd
 from tests.support.daemon_process import ROOT
 
 
@@ -179,10 +180,13 @@ def test_no_format_needs_open3d(tmp_path: Path) -> None:
         assert done.returncode == 0, done.stderr
 
 
-def test_las_without_laspy(tmp_path: Path) -> None:
-    columns = {axis: np.arange(5, dtype=np.float32) for axis in "xyz"}
-    write_las(tmp_path / "a.las", {**columns, "intensity": np.zeros(5)})
-    done = without("laspy", "inspect", tmp_path / "a.las")
+@pytest.mark.parametrize(("package", "suffix"), [("laspy", "las"), ("laspy", "laz"), ("lazrs", "laz")])
+def test_las_without_its_packages(tmp_path: Path, package: str, suffix: str) -> None:
+    """The hint is one, that of the page."""
+    path = las_file(tmp_path / f"a.{suffix}")
+    done = without(package, "inspect", path)
     assert done.returncode == 69
-    assert "LAS and LAZ need the Python package laspy" in done.stderr
-    assert "hint: pip install 'laspy[lazrs]', or convert the file to PCD\n" in done.stderr
+    assert f"LAS and LAZ need the Python package {package}" in done.stderr
+    command = re.search(r"hint: (pip install .*), or convert the file to PCD\n", done.stderr)
+    assert command is not None, done.stderr
+    assert f"`{command[1]}`" in (ROOT / "shmmap/INSTALL.md").read_text(encoding="utf-8")

@@ -136,3 +136,31 @@ def test_other_exceptions_are_reported_as_before() -> None:
         [sys.executable, "-c", program, "finalizer"], capture_output=True, text=True, timeout=60
     )
     assert "ValueError: odd" in done.stderr
+
+
+IN_AN_IMPORT = """\
+import signal, sys
+from shmmap.cli import main
+
+class At:
+    def find_spec(self, name, *_):
+        if name == "shmmap.cli.verbs.look.status":
+            signal.raise_signal(signal.SIGINT)
+
+sys.meta_path.insert(0, At())
+if "ignored" in sys.argv:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+sys.argv = ["shmmap", "status", "--help"]
+main()
+"""
+
+
+def test_ctrl_c_while_a_verb_is_imported_says_nothing() -> None:
+    """Python would print a traceback of imports; where a shell has it ignored, it stays so."""
+    done = subprocess.run([sys.executable, "-c", IN_AN_IMPORT], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, "", "")
+    done = subprocess.run(
+        [sys.executable, "-c", IN_AN_IMPORT, "ignored"], capture_output=True, text=True, timeout=60
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("usage: shmmap status")

@@ -15,7 +15,6 @@ from shmmap.protocol import events, live
 from shmmap.protocol import messages as m
 from shmmap.segment import header, layout
 from shmmap.statistics import layout as statistics_layout
-from shmmap.statistics.rows import HEAD
 
 PROTOCOL = files("shmmap.protocol").joinpath("PROTOCOL.md").read_text(encoding="utf-8")
 REQUESTS = PROTOCOL[: PROTOCOL.index("\n## Replies\n")]
@@ -152,11 +151,9 @@ def tables(document: str) -> list[list[tuple[int, str]]]:
         (
             STATISTICS,
             [
-                statistics_layout.START.size,
-                statistics_layout.EXTENSION.size,
+                statistics_layout.DESCRIPTIONS_OFFSET,
                 statistics_layout.STATE.size,
                 statistics_layout.CHANGES.size,
-                HEAD.size,
             ],
         ),
     ],

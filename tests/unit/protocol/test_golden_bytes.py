@@ -81,9 +81,9 @@ REQUESTS: list[tuple[Any, list[Any], str]] = [
         ),
     ),
     (
-        m.Selected(5, ("b.pcd", "b.pcd"), ("points",), None, None),
-        ["selected", 5, ["b.pcd", "b.pcd"], ["points"], None, None],
-        "96a873656c65637465640592a5622e706364a5622e70636491a6706f696e7473c0c0",
+        m.Selected(5, ("b.pcd", "b.pcd"), ("points",), None, None, True),
+        ["selected", 5, ["b.pcd", "b.pcd"], ["points"], None, None, True],
+        "97a873656c65637465640592a5622e706364a5622e70636491a6706f696e7473c0c0c3",
     ),
     (
         m.Release(6, bytes([2, 0, 0, 0, 0, 0, 0, 0])),
@@ -91,6 +91,7 @@ REQUESTS: list[tuple[Any, list[Any], str]] = [
         "93a772656c6561736506c4080200000000000000",
     ),
     (m.Stats(7), ["stats", 7], "92a5737461747307"),
+    (m.ListCells(15, 300), ["list_cells", 15, 300], "93aa6c6973745f63656c6c730fcd012c"),
     (m.Show(8, "a"), ["show", 8, "a"], "93a473686f7708a161"),
     (m.Reload(9), ["reload", 9], "92a672656c6f616409"),
     (m.Evict(10, ("a",)), ["evict", 10, ["a"]], "93a565766963740a91a161"),
@@ -98,6 +99,7 @@ REQUESTS: list[tuple[Any, list[Any], str]] = [
     (m.Pin(12, ("a",), ("points",)), ["pin", 12, ["a"], ["points"]], "94a370696e0c91a16191a6706f696e7473"),
     (m.Unpin(13, ("a",)), ["unpin", 13, ["a"]], "93a5756e70696e0d91a161"),
     (m.Shutdown(14), ["shutdown", 14], "92a873687574646f776e0e"),
+    (m.Cancel(5), ["cancel", 5], "92a663616e63656c05"),
     (e.Recent(15, 1, 2, 3), ["recent", 15, 1, 2, 3], "95a6726563656e740f010203"),
 ]
 REPLIES: list[tuple[Any, list[Any], str]] = [
@@ -270,6 +272,17 @@ REPLIES: list[tuple[Any, list[Any], str]] = [
             "640102030492cb3ff0000000000000cb4000000000000000cb3fe000000000000095a3626f780102"
             "030408090a0102"
         ),
+    ),
+    (
+        m.CellsPage(15, 3, (m.CellRow("a", "points", 1, "00", "stale", 1, 2, (0, 0, 20, 20), 3, 4, 5),), 7),
+        [
+            "cells_page",
+            15,
+            3,
+            [["a", "points", 1, "00", "stale", 1, 2, [0, 0, 20, 20], 3, 4, 5, False, []]],
+            7,
+        ],
+        "95aa63656c6c735f706167650f03919da161a6706f696e747301a23030a57374616c6501029400001414030405c29007",
     ),
     (
         m.ShownCell(
@@ -773,3 +786,8 @@ def test_elements_that_a_reply_lacks_have_their_defaults() -> None:
     reply = decode_reply(pack(elements[:9]))
     assert isinstance(reply, m.Cells)
     assert (reply.layers, reply.covered, reply.reason) == ((), True, "")
+
+
+def test_statistics_print_as_one_line() -> None:
+    reply = m.StatsReply(7, 3, 5, {f"counter_{n}": n for n in range(100)}, ())
+    assert repr(reply) == "<StatsReply of daemon run 0000000000000003: 100 counters, 0 sessions>"

@@ -156,10 +156,10 @@ def test_random_steps_against_a_model(shm: ShmDirectory, publish: Publish) -> No
     rng = random.Random(11)
     names = [publish(seed=i) for i in range(6)]
     held: dict[str, list[tuple[int | None, AttachedSegment]]] = {name: [] for name in names}
-    zombie = dict.fromkeys(names, "")
+    ending = dict.fromkeys(names, "")
     for _ in range(400):
         name = rng.choice(names)
-        current = name + zombie[name]
+        current = name + ending[name]
         action = rng.randrange(4)
         if action == 0 and len(held[name]) < 5:
             slot = rng.choice([None, rng.randrange(MAX_SLOT)])
@@ -167,9 +167,9 @@ def test_random_steps_against_a_model(shm: ShmDirectory, publish: Publish) -> No
         elif action == 1 and held[name]:
             held[name].pop(rng.randrange(len(held[name])))
         elif action == 2:
-            zombie[name] = "" if zombie[name] else ".zombie"
-            assert shm.rename(current, name + zombie[name])
-            current = name + zombie[name]
+            ending[name] = "" if ending[name] else ".zombie"
+            assert shm.rename(current, name + ending[name])
+            current = name + ending[name]
         assert pinned(shm, current) == bool(held[name])
         assert slots_of(shm, current) == sorted({slot for slot, _ in held[name] if slot is not None})
 

@@ -53,7 +53,7 @@ def image(tmp_path: Path) -> Path:
     executable(root / "usr/bin/kill")
     (root / "bin").symlink_to("usr/bin")
     (root / "usr/bin/python3").symlink_to("python3.11")
-    for name in ("shmmapd", "shmmap-ros-bridge"):
+    for name in ("shmmap", "shmmapd", "shmmap-ros-bridge"):
         executable(root / "opt/shmmap/bin" / name, "#!/opt/shmmap/bin/python3\n")
     (root / "opt/shmmap/bin/python3").symlink_to("/usr/bin/python3")
     (root / "srv/map").mkdir(parents=True)
@@ -81,6 +81,7 @@ def test_an_image_names_nothing_outside_of_itself(
         "etc/systemd/system/shmmapd@.service",
         "etc/systemd/system/shmmapd@.socket",
         "etc/systemd/system/shmmap-ros-bridge.service",
+        "etc/systemd/system/shmmap-metrics.service",
         "etc/sysusers.d/shmmap.conf",
         "etc/tmpfiles.d/shmmap.conf",
         "etc/shmmap/shmmap.toml",
@@ -305,6 +306,7 @@ def test_a_user_s_service(tmp_path: Path) -> None:
     write(planned)
     assert sorted(str(one.path.relative_to(tmp_path / "config")) for one in planned) == [
         "shmmap/shmmap.toml",
+        "systemd/user/shmmap-metrics.service",
         "systemd/user/shmmap-ros-bridge.service",
         "systemd/user/shmmapd.service",
         "systemd/user/shmmapd.socket",
@@ -415,6 +417,10 @@ def test_a_wheel_ships_them() -> None:
 
 def test_the_operators_guide_names_each_shipped_file() -> None:
     guide = read_page("systemd/README.md").text
-    named = set(re.findall(r"`((?:system|user|drop-ins|sysusers\.d|tmpfiles\.d)/[^`/ ]+)`", guide))
+    named = set(re.findall(r"`((?:system|user|drop-ins|prometheus|sysusers\.d|tmpfiles\.d)/[^`/ ]+)`", guide))
     named |= {"shmmap.toml"} if "`shmmap.toml`" in guide else set()
+    containers = read_page("shmmap/CONTAINERS.md").text
+    named |= set(re.findall(r"systemd/(container/[\w.]+)", containers)) | {
+        "container/Dockerfile.dockerignore"
+    }
     assert named == set(shipped_names()) - {"README.md"}

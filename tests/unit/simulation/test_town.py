@@ -10,12 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shmmap.demo.demo_town import HeightImage
 from shmmap.errors import BadRequest
 from shmmap.origin.map_directory import open_map
 from shmmap.simulation.town import Town
 from tests.support.divided_map import read_pcd
-from tests.support.pictures import png_pixels
 
 ORIGINS = [(0.0, 0.0), (-160.0, 40.0), (89_000.0, 43_000.0)]
 
@@ -175,18 +173,3 @@ def test_arguments_are_checked() -> None:
     for length, step in ((0.0, 1.0), (10.0, 0.0), (float("inf"), 1.0)):
         with pytest.raises(BadRequest):
             town.route(length=length, step=step)
-
-
-def test_height_image_shows_the_highest_point_north_up() -> None:
-    image = HeightImage((0.0, 0.0, 4.0, 2.0), pixel=1.0)
-    xyz = np.array(
-        [[0.5, 1.5, 0.0], [3.5, 0.5, 0.0], [3.5, 0.5, 12.0], [3.5, 0.5, 6.0], [9.0, 9.0, 9.0]], np.float32
-    )
-    image.add(xyz, np.array([20, 20, 30, 200, 200], np.float32))
-    colours = png_pixels(image.png(lambda x, y: 0.0 * (x + y)), "RGB").astype(int)
-    assert colours.shape == (2, 4, 3)
-    seen = (colours != 255).any(axis=2)
-    assert seen.tolist() == [[True, False, False, False], [False, False, False, True]]
-    red, _, blue = colours[1, 3]
-    assert red > blue + 40, "a roof, not the leaf below it"
-    assert np.ptp(colours[0, 0]) < 10, "grey road"

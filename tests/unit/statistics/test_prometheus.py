@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 from collections.abc import Iterator
@@ -17,6 +18,7 @@ from shmmap.statistics.identity import DaemonIdentity, pid_namespace, start_time
 from shmmap.statistics.prometheus import exposition
 from shmmap.statistics.reader import Snapshot, read_statistics
 from shmmap.statistics.writer import StatisticsWriter
+from tests.support.daemon_process import ROOT
 
 SAMPLE = re.compile(r'([a-zA-Z_:][a-zA-Z0-9_:]*)\{((?:[a-zA-Z_]\w*="(?:[^"\\\n]|\\["\\n])*",?)*)\} (\S+)')
 LABEL = re.compile(r'(\w+)="((?:[^"\\]|\\.)*)"')
@@ -50,6 +52,12 @@ def parse(text: str) -> tuple[dict[str, str], dict[tuple[str, str], float]]:
     return types, samples
 
 
+def conventional(name: str) -> str:
+    """A counter's name with its unit at the end, and the word that screens use."""
+    words = name.replace("zombies", "retired_segments").replace("zombie", "retired").split("_")
+    return "_".join([*words[1:], "bytes"] if words[0] == "bytes" else words)
+
+
 @pytest.fixture
 def found(shm: ShmDirectory) -> Iterator[Snapshot]:
     identity = DaemonIdentity(
@@ -78,8 +86,8 @@ def test_every_line_is_as_the_format_wants_it(found: Snapshot) -> None:
     exported = {name.removeprefix("shmmap_").removesuffix("_total") for name in types}
     assert samples["shmmap_longest_turn_requests_seconds", ""] == 0.012
     exported |= {f"{name.removesuffix('_seconds')}_ns" for name in exported}
-    expected = {c.name for c in COUNTERS if not c.name.endswith(("_10s", "_1min", "_10min"))}
-    not_yet = {"origin_out_since_unix_ns", *PUBLISHED}
+    expected = {conventional(c.name) for c in COUNTERS if not c.name.endswith(("_10s", "_1min", "_10min"))}
+    not_yet = {"origin_out_since_unix_ns", *map(conventional, PUBLISHED)}
     assert expected - not_yet - {"last_reload_unix_ns"} <= exported
     assert not not_yet & exported
     assert {f"{h.name}_seconds" for h in HISTOGRAMS} <= exported
@@ -90,7 +98,7 @@ def test_a_published_map(found: Snapshot) -> None:
     counts |= {"origin_out_since_unix_ns": 1_600_000_000_000_000_000, "objects_fetched": 5}
     found.__dict__["counters"] = counts
     types, samples = parse(exposition(found, "unit"))
-    assert {f"shmmap_{name}_total" for name in OBJECTS_READ} <= types.keys()
+    assert {f"shmmap_{conventional(name)}_total" for name in OBJECTS_READ} <= types.keys()
     assert samples["shmmap_published_version", ""] == 7
     assert samples["shmmap_objects_fetched_total", ""] == 5
     assert samples["shmmap_published_taken_timestamp_seconds", ""] == 1_500_000_000.5
@@ -122,7 +130,7 @@ def test_live_maps(found: Snapshot) -> None:
     exported = {key[0].removeprefix("shmmap_live_"): n for key, n in samples.items() if key[1] == "lidar"}
     assert exported == {
         "bytes": 4096, "waiting_bytes": 9, "budget_bytes": 1 << 20,
-        "active_voxels": 100, "files": 3, "file_bytes": 777, "scans_applied_total": 11,
+        "known_voxels": 100, "files": 3, "file_bytes": 777, "scans_applied_total": 11,
         "scans_durable_total": 7, "damaged_files": 0, "failing": 0,
     }  # fmt: skip
     assert {key[1]: n for key, n in samples.items() if key[0] == "shmmap_live_chunks"} == {
@@ -139,3 +147,34 @@ def test_live_maps(found: Snapshot) -> None:
 def test_a_daemon_that_is_not_there_is_not_up() -> None:
     _, samples = parse(exposition(Snapshot("absent", None), "unit"))
     assert samples == {("shmmap_up", ""): 0.0}
+
+
+def test_names_follow_the_conventions(found: Snapshot) -> None:
+    """Counters end in _total and nothing else does; bytes and seconds come last."""
+    found.__dict__["counters"] = found.counters | {"published_version": 7}
+    types, _ = parse(exposition(found, "unit"))
+    for name, kind in types.items():
+        assert (kind == "counter") == name.endswith("_total"), name
+        assert not re.search("_(ns|ms|bytes_(?!total$)|bytes_total_)", name), name
+        assert "zombie" not in name
+    for counter in COUNTERS:
+        name = f"shmmap_{conventional(counter.name)}"
+        if counter.unit == "bytes" and name in types:
+            assert re.search("_bytes(_total)?$", name)
+
+
+def test_alerts_and_dashboard_use_metrics_that_exist(found: Snapshot) -> None:
+    row = LiveMapRow("lidar", "/m", 0.1, "map", 5, 100, 4096, 1, 2, 1, 9, 3, 777, 11, 7, 1 << 20)
+    found.__dict__["live"] = [row]
+    found.__dict__["counters"] = found.counters | {"published_version": 7, "published_expires_unix_ns": 1}
+    types, samples = parse(exposition(found, "unit"))
+    known = {*types, *(name for name, _ in samples)}
+    for file in ("alerts.yml", "dashboard.json"):
+        text = (ROOT / "systemd/prometheus" / file).read_text()
+        if file == "dashboard.json":
+            text = "\n".join(
+                target["expr"] for panel in json.loads(text)["panels"] for target in panel["targets"]
+            )
+        used = set(re.findall(r"\bshmmap_\w+", text))
+        assert len(used) > 10
+        assert used <= known, used - known

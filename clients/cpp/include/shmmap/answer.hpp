@@ -21,6 +21,7 @@ namespace shmmap {
 struct Failure {
   std::string id, layer, code, message;
   std::optional<Box> box = std::nullopt;  ///< of the cell, if known
+  std::size_t holders = 0;                ///< of `over_budget`: users of the memory; none: it never fits
 };
 
 /// Result of a request for cells.

@@ -6,15 +6,19 @@
 //     shmmap::PcdLoader<Service> loader;                  // is a `PcdLoaderFunction`
 //     auto response = loader(request);                    // cells to add, ids to remove; or nullptr
 //
+//     shmmap::MapServices services;                       // for a node that serves the map: all three services
+//     auto response = services.answer<Service>(*request, lacks);
+//
 //     shmmap::NdtLeaves<Leaf> leaves(2.0);                // the same with precomputed voxels
 //     if (auto found = leaves(request)) use(found->grids_to_add, found->ids_to_remove);
 //
 // Includes no headers of ROS, PCL or Eigen: any types with members of these names work as messages and leaves.
 //
-// Autoware's `cached_ids` name the cells of a node, but not their versions.  So these objects remember the
-// version of each cell that they returned, and return a changed cell again under its id.  Use one object for
-// each holder of cells, and apply every result completely.  Copies share one state and one connection, and
-// several threads may use them: a second call waits for the end of the first.
+// Autoware's `cached_ids` name the cells of a node, but not their versions.  So these objects give out the version
+// with the id, `<id>@<16 hexadecimal digits>`, which Autoware's nodes keep and repeat as they keep any id.  A
+// changed cell comes under its new name, and its old name is among the ids to remove.  Nothing is remembered of
+// nodes: any number of them may share one object, and restarts of any part cost nothing.  Copies share one
+// connection, and several threads may use them: a second call waits for the end of the first.
 //
 // These objects never throw.  A call waits for cells, because a node with none or a part of them sends its next
 // request only 20 m further on.  It waits `LoaderOptions::wait` seconds for cells being loaded or for a daemon,
@@ -23,150 +27,15 @@
 #ifndef SHMMAP_AUTOWARE_HPP
 #define SHMMAP_AUTOWARE_HPP
 
-#include <functional>
-#include <limits>
 #include <locale>
-#include <mutex>
-#include <set>
+#include <shmmap/detail/map_requests.hpp>
 #include <shmmap/point_cloud2.hpp>
 #include <shmmap/shmmap.hpp>
 #include <sstream>
 
 namespace shmmap {
 
-/// Options of requests for cells.
-struct LoaderOptions {
-  Options client = {};  ///< how to find the daemon
-  double wait = 10.0;   ///< seconds, at most 3600; see above
-  /// Called in the caller's thread with a line about cells that could not be loaded.
-  std::function<void(const std::string&)> log = {};
-  /// Called ten times a second while a call waits; if it returns false, the call ends with the cells so far.
-  /// In a node: `[] { return rclcpp::ok(); }`, so that no request delays its shutdown.
-  std::function<bool()> keep_waiting = {};
-};
-
 namespace detail {
-
-/// Changes for a node that holds cells.
-template <typename Made>
-struct Difference {
-  std::map<std::string, Made> added;  ///< by id, which is the order of Autoware's loader
-  std::vector<std::string> removed;   ///< in the order of the held ids; none of `added`
-  std::string frame_id;
-};
-
-/// Remembers the versions of the cells that a caller holds by id, and requests missing ones.
-class HeldCells {
- public:
-  HeldCells(LoaderOptions options, std::string layer)
-      : options_(std::move(options)), layer_(std::move(layer)) {
-    if (options_.keep_waiting) options_.client.keep_waiting = options_.keep_waiting;
-  }
-
-  /// Cells of an area that `cached` lacks, each converted by `make` from the mapped cell, and ids to remove.
-  /// No value, with unchanged state, if cells are missing and no new one has arrived.  Each mapped cell is
-  /// released after its conversion, so that an area may be larger than the daemon's memory.
-  template <typename Make, typename Made = std::invoke_result_t<const Make&, const Cell&>>
-  std::optional<Difference<Made>> difference(const Area& area, const std::vector<std::string>& cached,
-                                             const Make& make) {
-    const std::lock_guard<std::mutex> one_at_a_time(mutex_);
-    Difference<Made> found;
-    std::map<std::string, std::uint64_t> held;  // cells of `cached` with known versions, and new cells
-    std::set<std::string> gone, missing;
-    bool covered = false;
-    std::string trouble;
-    for (const auto& id : cached)
-      if (const auto known = versions_.find(id); known != versions_.end()) held.insert(*known);
-    try {
-      const auto until = Clock::now() + std::chrono::duration_cast<Clock::duration>(Seconds(options_.wait));
-      for (bool again = true; again;) {
-        const auto answer = asked(area, held, until);
-        found.frame_id = client_->frame_id();
-        covered = answer.covered;
-        missing.clear();
-        trouble.clear();
-        const auto lacks = [&](const std::string& id, const std::string& why) {
-          missing.insert(id);
-          if (trouble.empty()) trouble = why;
-        };
-        for (const auto& id : answer.removed) {
-          held.erase(id);
-          found.added.erase(id);
-          gone.insert(id);
-        }
-        for (const auto& cell : answer.cells) {
-          try {
-            found.added.insert_or_assign(cell->id, make(*cell));
-            held[cell->id] = cell->version;
-            gone.erase(cell->id);
-          } catch (const Error& error) {  // the other cells are still usable
-            lacks(cell->id, error.what());
-          }
-        }
-        bool no_room = false;
-        for (const auto& failure : answer.failed) {
-          lacks(failure.id, failure.id + ": " + failure.message + " (" + failure.code + ")");
-          no_room = no_room || failure.code == "over_budget" || failure.code == "no_space";
-        }
-        for (const auto& [id, layer] : answer.pending) lacks(id, id + ": it is still being loaded");
-        // released cells make room; and requests do not wait for a map that is not known yet
-        again = (!covered || !answer.pending.empty() || (no_room && !answer.cells.empty())) &&
-                Clock::now() < until && is_wanted();
-        if (again && answer.cells.empty()) ::poll(nullptr, 0, 20);
-      }
-      if (!covered && trouble.empty()) trouble = "not all of the map is known yet";
-      if (missing.size() > 1) trouble += "; cells missing in all: " + std::to_string(missing.size());
-    } catch (const std::exception& error) {  // keep the cells before the error
-      client_.reset();
-      covered = false;
-      trouble = error.what();
-    }
-    if (!trouble.empty()) say(trouble);
-    if (!trouble.empty() && found.added.empty()) return std::nullopt;
-    std::set<std::string> seen;
-    for (const auto& id : cached) {
-      // a cell without known version was not requested: it is replaced, or not in the area
-      const bool is_foreign = versions_.count(id) == 0 && covered && missing.count(id) == 0;
-      if (found.added.count(id) == 0 && (is_foreign || gone.count(id) != 0) && seen.insert(id).second)
-        found.removed.push_back(id);
-    }
-    versions_ = std::move(held);
-    return found;
-  }
-
-  /// Log an error; an exception of the caller's log function does not end its node.
-  void say(const std::string& message) const noexcept {
-    try {
-      if (options_.log) options_.log("shmmap: " + message);
-    } catch (...) {  // NOLINT(bugprone-empty-catch): there is no other log
-    }
-  }
-
- private:
-  [[nodiscard]] bool is_wanted() const { return !options_.keep_waiting || options_.keep_waiting(); }
-
-  Answer asked(const Area& area, const std::map<std::string, std::uint64_t>& held, Clock::time_point until) {
-    while (!client_) {
-      try {
-        client_.emplace(options_.client);
-      } catch (const Unreachable& error) {
-        if (error.code() == "no_permission" || Clock::now() >= until || !is_wanted()) throw;
-        ::poll(nullptr, 0, 20);  // a starting daemon sends no notification
-      }
-    }
-    std::vector<Held> have;
-    have.reserve(held.size());
-    for (const auto& [id, version] : held) have.push_back({id, version});
-    const auto left = std::chrono::duration_cast<Seconds>(until - Clock::now()).count();
-    return client_->differential(area, have, {}, {layer_}, std::max(0.0, left));
-  }
-
-  LoaderOptions options_;
-  const std::string layer_;
-  std::mutex mutex_;
-  std::optional<Client> client_;
-  std::map<std::string, std::uint64_t> versions_;
-};
 
 /// The square of Autoware's area, from any message type.
 template <typename Request>
@@ -175,9 +44,51 @@ Square area_of(const Request& request) {
           static_cast<double>(request.area.radius)};
 }
 
+template <typename Request, typename = void>
+inline constexpr bool has_cached_ids = false;
+template <typename Request>
+inline constexpr bool has_cached_ids<Request, std::void_t<decltype(Request::cached_ids)>> = true;
+template <typename Request, typename = void>
+inline constexpr bool names_cells = false;
+template <typename Request>
+inline constexpr bool names_cells<Request, std::void_t<decltype(Request::cell_ids)>> = true;
+template <typename Response, typename = void>
+inline constexpr bool removes_ids = false;
+template <typename Response>
+inline constexpr bool removes_ids<Response, std::void_t<decltype(Response::ids_to_remove)>> = true;
+
+/// Names that the requester has; none if it cannot say.
 template <typename Request>
 std::vector<std::string> ids_of(const Request& request) {
-  return {request.cached_ids.begin(), request.cached_ids.end()};
+  if constexpr (has_cached_ids<Request>) return {request.cached_ids.begin(), request.cached_ids.end()};
+  return {};
+}
+
+template <typename Response>
+using CellMessage = typename decltype(Response::new_pointcloud_with_ids)::value_type;
+
+/// A cell as `PointCloudMapCellWithID`.
+template <typename Message>
+Message message_of(const std::string& name, const Cell& cell) {
+  Message message;
+  message.cell_id = name;
+  fill(message.pointcloud, cell);
+  auto& box = message.metadata;
+  box.min_x = static_cast<decltype(box.min_x)>(cell.min_x);
+  box.min_y = static_cast<decltype(box.min_y)>(cell.min_y);
+  box.max_x = static_cast<decltype(box.max_x)>(cell.max_x);
+  box.max_y = static_cast<decltype(box.max_y)>(cell.max_y);
+  return message;
+}
+
+template <typename Response>
+Response response_of(Difference<CellMessage<Response>>&& found) {
+  Response response;
+  response.header.frame_id = found.frame_id;
+  for (auto& [id, message] : found.added) response.new_pointcloud_with_ids.push_back(std::move(message));
+  if constexpr (removes_ids<Response>)
+    for (auto& name : found.removed) response.ids_to_remove.push_back(std::move(name));
+  return response;
 }
 
 }  // namespace detail
@@ -194,42 +105,97 @@ class PcdLoader {
   using Response = typename Service::Response;
 
   explicit PcdLoader(LoaderOptions options = {})
-      : cells_(std::make_shared<detail::HeldCells>(std::move(options), "points")) {}
+      : requests_(std::make_shared<detail::MapRequests>(std::move(options), "points")) {}
 
-  /// Cells of the area that the node lacks in the present version, and ids to remove; nullptr if they could not
-  /// be fetched.  Cells are in the order of ids, with points as from Autoware's loader; `header.frame_id` is the
-  /// map's, stamps are 0.  `request` is any kind of pointer.
+  /// Cells of the area that the node lacks in the present version, and names to remove; nullptr if something is
+  /// missing and nothing new has come.  Cells are in the order of ids, with points as from Autoware's loader;
+  /// `header.frame_id` is the map's, stamps are 0.  `request` is any kind of pointer.
   template <typename RequestPointer>
   std::shared_ptr<Response> operator()(const RequestPointer& request) const noexcept {
     try {
-      using CellMessage = typename decltype(Response::new_pointcloud_with_ids)::value_type;
-      auto found =
-          cells_->difference(detail::area_of(*request), detail::ids_of(*request), [](const Cell& cell) {
-            CellMessage message;
-            message.cell_id = cell.id;
-            detail::fill(message.pointcloud, cell);
-            auto& box = message.metadata;
-            box.min_x = static_cast<decltype(box.min_x)>(cell.min_x);
-            box.min_y = static_cast<decltype(box.min_y)>(cell.min_y);
-            box.max_x = static_cast<decltype(box.max_x)>(cell.max_x);
-            box.max_y = static_cast<decltype(box.max_y)>(cell.max_y);
-            return message;
-          });
-      if (!found) return nullptr;
-      auto response = std::make_shared<Response>();
-      response->header.frame_id = found->frame_id;
-      for (auto& [id, message] : found->added)
-        response->new_pointcloud_with_ids.push_back(std::move(message));
-      for (auto& id : found->removed) response->ids_to_remove.push_back(std::move(id));
-      return response;
+      auto found = requests_->difference(detail::area_of(*request), detail::ids_of(*request),
+                                         detail::message_of<detail::CellMessage<Response>>);
+      if (!found.trouble.empty()) requests_->say(found.trouble);
+      if (found.added.empty() && !found.complete) return nullptr;
+      return std::make_shared<Response>(detail::response_of<Response>(std::move(found)));
     } catch (const std::exception& error) {
-      cells_->say(error.what());
+      requests_->say(error.what());
       return nullptr;
     }
   }
 
  private:
-  std::shared_ptr<detail::HeldCells> cells_;
+  std::shared_ptr<detail::MapRequests> requests_;
+};
+
+/// What a service's answer lacks.
+struct Shortfall {
+  std::string why;        ///< a line for a log; empty: nothing is missing
+  std::size_t cells = 0;  ///< number of missing cells, as far as they are known
+  bool reached = false;   ///< a daemon is there
+};
+
+/// Answers all three of Autoware's map services, as its map loader does, for a node that serves them.  Differences: a
+/// cell that cannot be loaded is left out, where Autoware sends it empty; a changed cell comes again; a name that a
+/// request repeats is not removed for that reason.
+///
+/// Requesters take an empty answer for an empty map or for "no change".  So there is none while no daemon answers, or
+/// while all that could be sent has no room in memory; call again then.  Nothing is logged.
+class MapServices {
+ public:
+  /// The time of `options.wait` begins when a daemon is there.
+  explicit MapServices(LoaderOptions options = {})
+      : max_bytes_(options.max_bytes),
+        requests_(std::make_shared<detail::MapRequests>(std::move(options), "points")) {}
+
+  /// The answer to a request: `Service` is one of `autoware_map_msgs::srv`, `GetPartialPointCloudMap`,
+  /// `GetDifferentialPointCloudMap` or `GetSelectedPointCloudMap`, or has a `Request` and a `Response` of such a
+  /// shape.  What cannot be loaded is left out, and in `lacks`.  nullptr: call again; `lacks` says why.
+  template <typename Service>
+  std::shared_ptr<typename Service::Response> answer(const typename Service::Request& request,
+                                                     Shortfall& lacks) const noexcept {
+    using Response = typename Service::Response;
+    try {
+      constexpr auto make = detail::message_of<detail::CellMessage<Response>>;
+      if constexpr (detail::names_cells<typename Service::Request>) {
+        std::vector<std::string> ids(request.cell_ids.begin(), request.cell_ids.end());
+        auto found = requests_->selected(ids, make);
+        return answer_of<Response>(found, lacks, [&](Response& response) {
+          std::uint64_t bytes = 0;  // cells that a request repeats count again
+          for (const auto& id : ids) {
+            const auto cell = found.added.find(id);
+            if (cell == found.added.end()) continue;
+            bytes += cell->second.pointcloud.data.size();
+            if (bytes <= max_bytes_) response.new_pointcloud_with_ids.push_back(cell->second);
+            else ++lacks.cells, lacks.why = "the cells of a request are too much for one answer: ask for fewer at once";
+          }
+        });
+      } else {
+        auto found = requests_->difference(detail::area_of(request), detail::ids_of(request), make,
+                                           detail::Asker::service);
+        return answer_of<Response>(found, lacks, [&](Response& response) {
+          response = detail::response_of<Response>(std::move(found));
+        });
+      }
+    } catch (const std::exception& error) {
+      lacks = {error.what()};
+      return nullptr;
+    }
+  }
+
+ private:
+  template <typename Response, typename Made, typename Fill>
+  static std::shared_ptr<Response> answer_of(detail::Difference<Made>& found, Shortfall& lacks, const Fill& fill) {
+    lacks = {std::move(found.trouble), found.missing, found.reached};
+    if (!found.answered) return nullptr;
+    auto response = std::make_shared<Response>();
+    fill(*response);
+    response->header.frame_id = found.frame_id;
+    return response;
+  }
+
+  std::uint64_t max_bytes_;
+  std::shared_ptr<detail::MapRequests> requests_;
 };
 
 // --- voxels ----------------------------------------------------------------------------------------------
@@ -271,7 +237,8 @@ std::vector<Leaf> ndt_leaves(const Cell& cell) {
   return leaves;
 }
 
-/// Like `PcdLoader`, but with voxels instead of points, which need not be computed.
+/// Like `PcdLoader`, but with voxels instead of points, which need not be computed.  A cell's name has the version of
+/// its voxels.
 template <typename Leaf>
 class NdtLeaves {
  public:
@@ -286,21 +253,25 @@ class NdtLeaves {
 
   /// `resolution`: edge of a voxel in metres, the node's `ndt.resolution`.
   explicit NdtLeaves(double resolution = 2.0, LoaderOptions options = {})
-      : cells_(std::make_shared<detail::HeldCells>(std::move(options), layer(resolution))) {}
+      : requests_(std::make_shared<detail::MapRequests>(std::move(options), layer(resolution))) {}
 
-  /// Like `PcdLoader`; no value if the cells could not be fetched.
+  /// Like `PcdLoader`; no value if something is missing and nothing new has come.
   template <typename RequestPointer>
   std::optional<Update> operator()(const RequestPointer& request) const noexcept {
     try {
-      auto found = cells_->difference(detail::area_of(*request), detail::ids_of(*request), ndt_leaves<Leaf>);
-      if (!found) return std::nullopt;
+      auto found = requests_->difference(detail::area_of(*request), detail::ids_of(*request),
+                                         [](const std::string& name, const Cell& cell) {
+                                           return Grid{name, ndt_leaves<Leaf>(cell)};
+                                         });
+      if (!found.trouble.empty()) requests_->say(found.trouble);
+      if (found.added.empty() && !found.complete) return std::nullopt;
       Update update;
-      update.ids_to_remove = std::move(found->removed);
-      update.grids_to_add.reserve(found->added.size());
-      for (auto& [id, leaves] : found->added) update.grids_to_add.push_back({id, std::move(leaves)});
+      update.ids_to_remove = std::move(found.removed);
+      update.grids_to_add.reserve(found.added.size());
+      for (auto& [id, grid] : found.added) update.grids_to_add.push_back(std::move(grid));
       return update;
     } catch (const std::exception& error) {
-      cells_->say(error.what());
+      requests_->say(error.what());
       return std::nullopt;
     }
   }
@@ -314,7 +285,7 @@ class NdtLeaves {
     return spec.str();
   }
 
-  std::shared_ptr<detail::HeldCells> cells_;
+  std::shared_ptr<detail::MapRequests> requests_;
 };
 
 }  // namespace shmmap

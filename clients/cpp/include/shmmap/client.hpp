@@ -70,7 +70,7 @@ class Unmapped {
 
 /// How a client finds the daemon, and its own name and limits.
 struct Options {
-  std::string endpoint = {};  ///< the socket's path; empty: from the environment, as for every client
+  std::string endpoint = {};  ///< the socket's path, or an instance's name; empty: from the environment, as for all
   std::string name = {};      ///< name of the program in `shmmap top`; at most 64 characters
   std::string shm_dir = {};   ///< where this process finds segments; empty: `SHMMAP_SHM_DIR`, or as the daemon says
   double timeout = 5.0;       ///< seconds to wait for an answer, beyond the `wait` of a request
@@ -116,10 +116,13 @@ inline bool is_private(const std::string& directory) {
 
 /// The sockets to try, in this order.
 inline std::vector<std::string> endpoints(std::string given) {
-  if (given.empty()) given = variable("SHMMAP_ENDPOINT");
+  std::string named;
+  if (given.find_first_of("/.@") == std::string::npos) named.swap(given);
+  if (given.empty() && named.empty()) given = variable("SHMMAP_ENDPOINT");
   if (given.compare(0, 6, "ipc://") == 0) given.erase(0, 6);
   if (!given.empty()) return {given};
-  const std::string named = variable("SHMMAP_INSTANCE"), directory = variable("SHMMAP_RUNTIME_DIR");
+  if (named.empty()) named = variable("SHMMAP_INSTANCE");
+  const std::string directory = variable("SHMMAP_RUNTIME_DIR");
   const std::string file = "/" + (named.empty() ? "default" : named) + ".sock";
   if (!directory.empty()) return {directory + file};
   std::vector<std::string> found;
@@ -222,6 +225,10 @@ class Client {
   [[nodiscard]] const std::string& instance() const noexcept { return welcome_.instance; }
   /// The frame of all coordinates.
   [[nodiscard]] const std::string& frame_id() const noexcept { return welcome_.frame_id; }
+  /// An id as cells have it: one without a leading slash lacks the map's directory.
+  [[nodiscard]] std::string whole(const std::string& id) const {
+    return !id.empty() && id.front() == '/' ? id : welcome_.id_prefix + id;
+  }
   /// The connection's descriptor, for event loops: readable when the daemon has ended.
   [[nodiscard]] int fd() const noexcept { return socket_.fd(); }
   /// Whether the connection is open, as far as the kernel knows; if not, the next request reconnects.
@@ -609,10 +616,6 @@ class Client {
       else answer.pending.emplace_back(whole(handles[at].id), handles[at].layer);
     }
     gone = std::move(still);
-  }
-
-  std::string whole(const std::string& id) const {
-    return !id.empty() && id.front() == '/' ? id : welcome_.id_prefix + id;
   }
 
   [[nodiscard]] const std::string& shm_dir() const {

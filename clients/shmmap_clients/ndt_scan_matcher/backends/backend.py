@@ -26,22 +26,6 @@ from shmmap import BadRequest, ShmmapError
 from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
 from shmmap_clients.ndt_scan_matcher.matching.evaluation import Evaluation, Scoring
 
-__all__ = [
-    "Backend",
-    "DeviceError",
-    "DeviceHung",
-    "DeviceMemory",
-    "DeviceOptions",
-    "KernelBuildFailed",
-    "MapMemory",
-    "NoDevice",
-    "Precision",
-    "ScanBuffer",
-    "UploadStatistics",
-    "check_batch",
-    "device_errors",
-]
-
 Precision = Literal["auto", "double", "float"]
 MapMemory = Literal["auto", "svm", "copy"]
 _OUT_OF_MEMORY = (
@@ -201,7 +185,7 @@ class DeviceError(ShmmapError):
 
     code = "device_error"
     exit_code = 69
-    advice = "`shmmap-ndt device-check` examines it; `--backend numba` needs no device"
+    advice = "`shmmap-ndt warmup --backend opencl` tries it; `--backend numba` needs no device"
 
 
 class NoDevice(DeviceError):

@@ -12,8 +12,6 @@ from shmmap.compiling import compiled, inlined, read_only
 from shmmap_clients.elements_at import float64_at, int32_at
 from shmmap_clients.ndt_scan_matcher.matching.evaluation import NEGLIGIBLE_EXPONENT
 
-__all__ = ["MAP", "SCRATCH", "add_nearest", "exp_of_negated"]
-
 MAP: Final = (
     read_only(types.int64, 2),  # table
     read_only(types.float64, 2),  # origins

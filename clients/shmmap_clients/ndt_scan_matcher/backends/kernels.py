@@ -25,8 +25,6 @@ from shmmap_clients.ndt_scan_matcher.backends.crowded_kernel import MAP, SCRATCH
 from shmmap_clients.ndt_scan_matcher.matching.evaluation import NEGLIGIBLE_EXPONENT
 from shmmap_clients.ndt_scan_matcher.matching.pose_batch import FLAT, SINGULAR, SMALL_ANGLE
 
-__all__ = ["CONTRACTED", "accumulate", "contract", "derive", "loaded_from_cache", "step_into"]
-
 _SIGNATURE: Final = types.void(
     read_only(types.float64, 2),  # source
     types.int64,  # chunks of the source

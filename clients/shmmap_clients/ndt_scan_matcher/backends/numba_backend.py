@@ -29,8 +29,6 @@ from shmmap_clients.ndt_scan_matcher.matching.evaluation import (
 )
 from shmmap_clients.ndt_scan_matcher.matching.settings import Limits
 
-__all__ = ["NumbaBackend"]
-
 _BATCH_ROWS: Final = 4096  # rows in one batch of poses: 256 poses of 2048 points
 
 

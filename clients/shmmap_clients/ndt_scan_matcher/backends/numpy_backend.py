@@ -35,8 +35,6 @@ from shmmap_clients.ndt_scan_matcher.matching.pose_batch import (
 )
 from shmmap_clients.ndt_scan_matcher.matching.settings import Limits
 
-__all__ = ["NumpyBackend"]
-
 _BLOCK_POINTS: Final = 4096  # keeps intermediate arrays within the caches
 
 

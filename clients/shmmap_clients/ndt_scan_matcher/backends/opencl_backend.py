@@ -2,7 +2,15 @@
 """Backend for any device with an OpenCL driver: GPUs, accelerators, and processors.
 
 The map's Gaussians are copied to the device, or read in place from shared memory.  A batch of poses is one
-launch.  All buffers are allocated once, as large as the limits allow.
+launch.  All buffers are allocated once, as large as the limits allow; a map for which a device has no room is
+cut and counted as by any other limit.
+
+Without double precision (or with ``--precision float``) coordinates are relative to the vehicle, so that
+floats are as good 90 km from the map's origin; segments hold doubles, so the map is always copied then.
+
+The program is plain OpenCL C 1.2 with optional double precision, built where it runs: the driver needs a
+compiler.  On RISC-V nothing was tried: pyopencl, numba and Open3D have no wheels there and have to be built
+(the backends ``numpy`` and ``opencl`` work without numba).
 """
 
 from __future__ import annotations
@@ -44,8 +52,6 @@ from shmmap_clients.ndt_scan_matcher.matching.pose_batch import (
     numpy_step,
 )
 from shmmap_clients.ndt_scan_matcher.matching.settings import Limits
-
-__all__ = ["OpenclBackend", "build_kernel", "kernel_source"]
 
 _POSE: Final = 40  # numbers of a pose in the kernel
 _LAUNCH_ROWS: Final = 4096  # chunks in a launch of many poses: 256 poses of 2048 points

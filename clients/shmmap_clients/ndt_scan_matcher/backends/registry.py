@@ -25,8 +25,6 @@ from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
 from shmmap_clients.ndt_scan_matcher.matching.evaluation import Evaluation, Scoring
 from shmmap_clients.ndt_scan_matcher.matching.settings import Limits
 
-__all__ = ["BACKENDS", "FallbackBackend", "backend_named"]
-
 _T = TypeVar("_T")
 
 

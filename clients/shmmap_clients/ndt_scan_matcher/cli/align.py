@@ -26,6 +26,7 @@ from shmmap_clients.shared_options import (
     add_scoring_options,
     add_thin_option,
     add_trust_options,
+    bag_options_from,
     pose_from,
     pose_text,
     reader_from,
@@ -35,8 +36,6 @@ from shmmap_clients.shared_options import (
 
 if TYPE_CHECKING:
     from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher
-
-__all__ = ["add_alignment_options", "add_parser", "matcher_from", "run"]
 
 _JSON = f"""\
 JSON (fields may be added, none is removed):
@@ -88,12 +87,13 @@ def run(args: argparse.Namespace) -> int:
 
     from shmmap_clients.map_extent import extent_text
     from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap, voxel_cell
+    from shmmap_clients.scan_drive import read_one_scan
     from shmmap_clients.scans.scan_file import thinned
 
     T_guess = pose_from(args, "--guess") if args.guess is not None else np.eye(4)
     cloud = reader_from(args, "shmmap-ndt", min_range=0.0).points(args.map)
     reader = reader_from(args, "shmmap-ndt")
-    scan = thinned(reader.points(args.scan), args.thin or None)
+    scan = thinned(read_one_scan(args.scan, reader, bag_options_from(args)).xyz, args.thin or None)
     with matcher_from(args) as matcher:
         voxel_map = VoxelMap(
             {args.map: voxel_cell(cloud, args.leaf)},

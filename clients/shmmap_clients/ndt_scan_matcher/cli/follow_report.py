@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from shmmap import Client
+from shmmap_clients.command_line import format_bytes
 from shmmap_clients.map_extent import map_extent
 from shmmap_clients.ndt_scan_matcher.drive.drive_summary import DriveStatistics, DriveSummary
 from shmmap_clients.ndt_scan_matcher.drive.follower import Frame
@@ -11,8 +12,6 @@ from shmmap_clients.ndt_scan_matcher.map.map_updater import MapUpdater
 from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher
 from shmmap_clients.pose_initializer import Relocalizer
 from shmmap_clients.scan_drive import ScanDrive
-
-__all__ = ["FollowReport", "print_summary"]
 
 
 class FollowReport:
@@ -121,10 +120,10 @@ def print_summary(summary: DriveSummary, left_out: str = "") -> None:
         f"map             updates: {s.map_updates}, cells added: {s.cells_added}, cells removed:"
         f" {s.cells_removed}, scans that waited for it: {s.waited}"
     )
-    print(f"  own memory    {s.map_private_bytes / 1e6:.2f} MB at most, beside the shared memory")
+    print(f"  own memory    {format_bytes(s.map_private_bytes)} at most, beside the shared memory")
     if s.map_writes:
         again = f", laid out again {s.map_laid_out_again} times" if s.map_laid_out_again else ""
-        print(f"  on the device {s.map_written_bytes / 1e6:.2f} MB written in {s.map_writes} writes{again}")
+        print(f"  on the device {format_bytes(s.map_written_bytes)} written in {s.map_writes} writes{again}")
     if s.errors is not None:
         e = s.errors
         print(

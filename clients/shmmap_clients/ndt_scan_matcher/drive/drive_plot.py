@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A drive as one SVG picture: its path, its errors, its latencies."""
+"""A drive as one SVG picture: its path on the map, its errors, its latencies."""
 
 from __future__ import annotations
 
@@ -7,18 +7,22 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple
 
-from shmmap.formats.svg import Axes, Page, box_around, dash, element
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap.formats.svg import PALE, Axes, Page, box_around, dash, element, swatch
 from shmmap_clients.ndt_scan_matcher.drive.drive_summary import pose_errors
 from shmmap_clients.ndt_scan_matcher.drive.follower import Frame
+from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelCell, VoxelMap
 from shmmap_clients.spread import Decimated
-
-__all__ = ["DrivePlot", "value_label"]
 
 _WIDTH: Final = 900.0
 _MARGIN: Final = 60.0
 _PATH_HEIGHT: Final = 320.0
 _CHART_HEIGHT: Final = 100.0
+_BESIDE_M: Final = 25.0  # of the map, on each side of the path
 _OURS, _TRUTH, _BAD, _SECOND = "#1f6fb4", "#999999", "#c0392b", "#e08e0b"
+_GROUND, _WALL = "#e4e7eb", "#868e96"
 
 
 class _Row(NamedTuple):
@@ -40,9 +44,19 @@ class DrivePlot:
         self._frames = 0
         self._rows: Decimated[_Row] = Decimated()
         self._untrusted: Decimated[tuple[float, float]] = Decimated()
+        self._map: VoxelMap | None = None
+        self._leaf = 1.0
+        self._columns: dict[
+            str, NDArray[np.int32]
+        ] = {}  # of each cell: place on the lattice, voxels above it
 
-    def add(self, frame: Frame) -> None:
-        """Add the next frame."""
+    def add(self, frame: Frame, voxel_map: VoxelMap | None = None) -> None:
+        """Add the next frame, and the map that it was aligned with."""
+        if voxel_map is not None and voxel_map is not self._map:
+            self._map, self._leaf = voxel_map, voxel_map.leaf
+            for key, cell in voxel_map.cells.items():
+                if key not in self._columns:
+                    self._columns[key] = _columns(cell)
         T, truth = frame.result.T_map_base, frame.T_truth
         error_m = error_deg = math.nan
         if truth is not None:
@@ -64,17 +78,25 @@ class DrivePlot:
         page.heading(30, f"{self._frames} scans")
         ours = [row.ours for row in rows]
         truth = [row.truth for row in rows if row.truth is not None]
-        axes = Axes.fitted(page, box_around([*ours, *truth, *untrusted]), 50, _PATH_HEIGHT)
+        box, columns = box_around([*ours, *truth, *untrusted]), list(self._columns.values())
+        if columns:
+            box = (box[0] - _BESIDE_M, box[1] - _BESIDE_M, box[2] + _BESIDE_M, box[3] + _BESIDE_M)
+        axes = Axes.fitted(page, box, 50, _PATH_HEIGHT)
+        if columns:
+            _draw_map(axes, np.concatenate(columns), self._leaf)
+        axes.coordinates(font_size=12, fill=PALE)
         axes.line(truth, stroke=_TRUTH, stroke_width=4)
         axes.line(ours, stroke=_OURS, stroke_width=1.5)
         for x, y in untrusted:
             axes.dot(x, y, 3, fill=_BAD)
         entries = [(dash(stroke=_OURS, stroke_width=1.5), "poses")]
+        if columns:
+            entries += [(swatch(fill=_GROUND), "map: ground"), (swatch(fill=_WALL), "walls")]
         if truth:
             entries.append((dash(stroke=_TRUTH, stroke_width=4), "truth"))
         if untrusted:
             entries.append((element("circle", cx=9, cy=-5, r=3, fill=_BAD), "not trusted"))
-        top = axes.legend(axes.bottom + 34, entries) + 56
+        top = axes.legend(axes.bottom + 48, entries) + 56
         charts = [
             (
                 "latency (blue) and alignment (orange), ms",
@@ -91,6 +113,30 @@ class DrivePlot:
             _chart(page, top, title, lines)
             top += _CHART_HEIGHT + 50
         return page.svg(top - 30)
+
+
+def _columns(cell: VoxelCell) -> NDArray[np.int32]:
+    """Return the lattice columns of a cell that have voxels: i, j and their number, (N, 3)."""
+    voxels = np.count_nonzero(cell.lattice >= 0, axis=2)
+    i, j = np.nonzero(voxels)
+    found = np.column_stack([i + cell.lattice_origin[0], j + cell.lattice_origin[1], voxels[i, j]])
+    return found.astype(np.int32)
+
+
+def _draw_map(axes: Axes, columns: NDArray[np.int32], leaf: float) -> None:
+    """Draw the map's lattice columns: ground, and over it what is higher than that."""
+    low_x, low_y, high_x, high_y = axes.box
+    x, y = columns[:, 0] * leaf, columns[:, 1] * leaf
+    shown = columns[(x > low_x - leaf) & (x < high_x) & (y > low_y - leaf) & (y < high_y)].astype(np.int64)
+    walls = shown[:, 2] > 2
+    if len(shown):
+        with axes.clipped():
+            parts = [(shown[~walls, :2], _rgba(_GROUND)), (shown[walls, :2], _rgba(_WALL))]
+            axes.raster(parts, leaf)
+
+
+def _rgba(colour: str) -> tuple[int, ...]:
+    return (*bytes.fromhex(colour[1:]), 255)
 
 
 def value_label(value: float) -> str:

@@ -19,15 +19,6 @@ from shmmap_clients.ndt_scan_matcher.matching.result import TrustLimits
 from shmmap_clients.scans.trajectory import quaternion_of
 from shmmap_clients.spread import RunningSpread, Spread
 
-__all__ = [
-    "DriveStatistics",
-    "DriveSummary",
-    "RunningErrors",
-    "TrajectoryErrors",
-    "frame_document",
-    "pose_errors",
-]
-
 _STRETCHES_M: Final = (10.0, 50.0, 100.0)
 _START_EVERY_M: Final = 0.05  # a standing vehicle starts no stretches
 Matrix = NDArray[np.float64]

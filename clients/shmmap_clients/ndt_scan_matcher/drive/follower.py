@@ -29,8 +29,6 @@ from shmmap_clients.ndt_scan_matcher.matching.result import Result
 from shmmap_clients.scans.scan_file import thinned
 from shmmap_clients.scans.scan_sequence import Scan
 
-__all__ = ["LOST_AFTER", "Follower", "Frame", "Relocalize", "State", "Tracking"]
-
 State = Literal["tracking", "uncertain", "lost"]
 LOST_AFTER: Final = 5  # Autoware's ndt_scan_matcher reports an error after as many rejected poses
 _BLIND_SEARCHES: Final = 4
@@ -55,6 +53,10 @@ class Tracking:
         if lost_after < 1:
             raise BadRequest(f"lost_after must be positive, it is {lost_after}")
         self._lost_after = lost_after
+        self.restart(lost=lost)
+
+    def restart(self, *, lost: bool) -> None:
+        """Begin again."""
         self._untrusted = 0
         self.state: State = "lost" if lost else "uncertain"
 
@@ -153,6 +155,17 @@ class Follower:
         self._jumped = False
         self._map: VoxelMap | None = None
 
+    @property
+    def map(self) -> VoxelMap | None:
+        """The map that the last scan was aligned with; None before the first."""
+        return self._map
+
+    def restart(self, T_map_base: NDArray[np.float64], *, lost: bool) -> None:
+        """Begin again at a pose, (4, 4); ``lost`` if it is only roughly known."""
+        self._prediction.restart(T_map_base)
+        self._tracking.restart(lost=lost)
+        self._jumped = True
+
     def follow(self, scan: Scan) -> Frame:
         """Align the next scan.
 
@@ -168,7 +181,7 @@ class Follower:
         step_s = self._prediction.step(scan.stamp_s)
         thinned_at = time.perf_counter()
         vx, vy = self._prediction.velocity
-        voxel_map, waited = self._maps.map_at(
+        voxel_map = self._maps.map_at(
             float(T_guess[0, 3]), float(T_guess[1, 3]), vx=vx, vy=vy, jumped=self._jumped
         )
         self._jumped = False
@@ -211,7 +224,7 @@ class Follower:
             map_s=had_map_at - thinned_at,
             align_s=aligned_at - had_map_at,
             relocalize_s=time.perf_counter() - aligned_at,
-            waited=waited,
+            waited=self._maps.waited,
         )
 
 

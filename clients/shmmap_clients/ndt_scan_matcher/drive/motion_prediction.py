@@ -3,25 +3,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap_clients.scans.trajectory import Trajectory
-
-__all__ = [
-    "LONGEST_STEP_S",
-    "ConstantVelocity",
-    "MotionPrediction",
-    "Odometry",
-    "first_twist",
-    "interpolate",
-    "twist_between",
-    "twist_on_route",
-]
+from shmmap_clients.scans.trajectory import Trajectory, interpolate, motion_of, moved
 
 LONGEST_STEP_S: Final = 1.0 + 1e-3
 """Longest time between two scans of a 1 Hz scanner, with tolerance; more is a pause or a clock jump."""
@@ -51,6 +39,10 @@ class ConstantVelocity:
     """
 
     def __init__(self, T_map_base: Matrix, twist: NDArray[np.float64] | None = None) -> None:
+        self.restart(T_map_base, twist)
+
+    def restart(self, T_map_base: Matrix, twist: NDArray[np.float64] | None = None) -> None:
+        """Begin again at a pose, as for the first scan."""
         self.T_known = T_map_base
         self._twist = twist
         self._stamp_s: float | None = None  # of the last scan
@@ -63,7 +55,7 @@ class ConstantVelocity:
         elapsed_s = self._elapsed(stamp_s)
         if elapsed_s is None or self._twist is None:
             return self.T_known
-        return np.asarray(self.T_known @ _moved(self._twist * min(elapsed_s, LONGEST_STEP_S)), np.float64)
+        return np.asarray(self.T_known @ moved(self._twist * min(elapsed_s, LONGEST_STEP_S)), np.float64)
 
     def step(self, stamp_s: float) -> float | None:
         """Return the time since the last scan, seconds; 0 for the first, None where the clock has jumped."""
@@ -171,7 +163,7 @@ MotionPrediction = ConstantVelocity
 
 def twist_between(T_before: Matrix, T_after: Matrix, seconds: float) -> NDArray[np.float64]:
     """Return the constant velocity from one pose to another, (6,), metres and radians per second."""
-    return _motion(np.linalg.inv(T_before) @ T_after) / seconds
+    return motion_of(np.linalg.inv(T_before) @ T_after) / seconds
 
 
 def first_twist(drive: Trajectory) -> NDArray[np.float64] | None:
@@ -201,39 +193,3 @@ def twist_on_route(route: Trajectory, T_map_base: Matrix) -> NDArray[np.float64]
     if not 0.0 < seconds <= LONGEST_STEP_S:
         return None
     return np.concatenate([T_map_base[:3, :3].T @ metres / seconds, np.zeros(3)])
-
-
-def interpolate(trajectory: Trajectory, stamp_s: float) -> Matrix | None:
-    """Return the interpolated pose at a time; None before the first or after the last entry."""
-    stamps = trajectory.stamps_s
-    if not len(stamps) or stamp_s < stamps[0] or stamp_s > stamps[-1]:
-        return None
-    after = int(np.searchsorted(stamps, stamp_s))
-    if stamps[after] == stamp_s:
-        return np.asarray(trajectory.T_map_sensor[after], np.float64)
-    a, b = trajectory.T_map_sensor[after - 1], trajectory.T_map_sensor[after]
-    share = (stamp_s - stamps[after - 1]) / (stamps[after] - stamps[after - 1])
-    return np.asarray(a @ _moved(_motion(np.linalg.inv(a) @ b) * share), np.float64)
-
-
-def _motion(T: Matrix) -> NDArray[np.float64]:
-    """Return the translation and rotation vector of a transform, (6,)."""
-    R = T[:3, :3]
-    axis = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    sine, cosine = float(np.linalg.norm(axis)) / 2.0, (float(np.trace(R)) - 1.0) / 2.0
-    angle = math.atan2(sine, cosine)
-    # near half a turn the axis is undefined; no vehicle turns that far between two scans
-    scale = 0.5 if sine < 1e-9 else angle / (2.0 * sine)
-    return np.concatenate([T[:3, 3], axis * scale])
-
-
-def _moved(motion: NDArray[np.float64]) -> Matrix:
-    """Return the transform, (4, 4), of a translation and a rotation vector (Rodrigues)."""
-    x, y, z = motion[3:]
-    angle = math.sqrt(x * x + y * y + z * z)
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    T = np.eye(4)
-    if angle > 1e-12:
-        T[:3, :3] += math.sin(angle) / angle * K + (1 - math.cos(angle)) / angle**2 * (K @ K)
-    T[:3, 3] = motion[:3]
-    return T

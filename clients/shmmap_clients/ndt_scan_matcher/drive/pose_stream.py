@@ -22,8 +22,6 @@ from shmmap_clients.ndt_scan_matcher.drive.follower import Frame
 from shmmap_clients.scans.trajectory import Trajectory, pose_of
 from shmmap_clients.streams import Publisher, Subscriber
 
-__all__ = ["OdometrySubscriber", "PoseMessage", "PosePublisher", "decode_pose"]
-
 _VERSION = 1
 _QUEUE = 1000  # messages queued for a slow reader; further messages are dropped
 _LINGER_MS = 2000

@@ -28,8 +28,6 @@ from shmmap_clients.ndt_scan_matcher.backends.backend import UploadStatistics
 from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelCell, VoxelMap, cell_from_layer
 from shmmap_clients.spread import RunningSpread
 
-__all__ = ["MapRules", "MapUpdater", "UpdateStatistics"]
-
 _REFRESH_S: Final = 1.0  # Autoware's timer; also the longest delay until a changed map is noticed
 _STEP_S: Final = 5.0  # interval of asking the daemon whether a map is still being loaded
 _ARRIVAL_S: Final = 60.0
@@ -149,6 +147,13 @@ class MapUpdater:
         Known path ahead of the vehicle, (N, 2), metres, map frame; the daemon prefetches the cells along
         it.
 
+    Attributes
+    ----------
+    waited
+        Whether the last `map_at` had to wait for its map.
+    too_slow
+        Number of maps that were waited for although the pose had not jumped.
+
     Raises
     ------
     ShmmapError
@@ -168,6 +173,7 @@ class MapUpdater:
         self.rules = rules if rules is not None else MapRules()
         self.statistics = UpdateStatistics(uploads if uploads is not None else UploadStatistics())
         self.too_slow = 0
+        self.waited = False
         self._prepare = prepare
         self._route = route
         self._velocity = (0.0, 0.0)
@@ -216,8 +222,8 @@ class MapUpdater:
 
     def map_at(
         self, x: float, y: float, *, vx: float = 0.0, vy: float = 0.0, jumped: bool = False
-    ) -> tuple[VoxelMap, bool]:
-        """Return the newest map, and whether the call had to wait for it.
+    ) -> VoxelMap:
+        """Return the newest map; `waited` is whether this call had to wait for it.
 
         If the daemon's map has no cells around the position, the `VoxelMap` is empty.
 
@@ -253,7 +259,8 @@ class MapUpdater:
                     self._error = None  # of an earlier attempt
                 self._wait_for(x, y)
             assert self._latest is not None  # noqa: S101  # waited for
-            return self._latest[0], not reached
+            self.waited = not reached
+            return self._latest[0]
 
     def wait_until_current(self, timeout_s: float) -> bool:
         """Wait until all requests have been answered; return False on timeout."""

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from shmmap import Cell
     from shmmap.layers import LayerTable
 
-__all__ = ["TABLE_COLUMNS", "Covariance", "VoxelCell", "VoxelMap", "cell_from_layer", "voxel_cell"]
-
 _COLUMNS: Final = ("table", "mean", "inverse_covariance", "scatter", "count")
 Covariance = Literal["autoware", "pclomp", "pcl"]
 TABLE_COLUMNS: Final = 13  # addresses of lattice, mean, inverse; then the columns of `VoxelMap.boxes`
@@ -71,6 +69,9 @@ class VoxelCell:
     scatter: NDArray[np.float64]
     inverse: NDArray[np.float64]
     memory: object = None
+
+    def __repr__(self) -> str:
+        return f"<VoxelCell of {len(self.count)} voxels of {self.leaf:g} m>"
 
     @property
     def map_bytes(self) -> int:
@@ -196,6 +197,9 @@ class VoxelMap:
         self.boxes = _boxes(list(kept.values()))
         self.box, self.column_start, self.column_cell = _directory(self.boxes)
         self._tables: dict[Covariance, NDArray[np.int64]] = {}
+
+    def __repr__(self) -> str:
+        return f"<VoxelMap of {len(self.cells)} cells, {self.voxels} voxels of {self.leaf:g} m>"
 
     def inverses(self, key: str, covariance: Covariance) -> NDArray[np.float64]:
         """Return (V, 6) inverse covariances of a cell; the cell's own array if it has this kind."""

@@ -23,32 +23,6 @@ from numpy.typing import NDArray
 
 from shmmap_clients.ndt_scan_matcher.map.voxel_map import Covariance
 
-__all__ = [
-    "AX",
-    "BJ",
-    "CHUNK_POINTS",
-    "CUT_NEIGHBOURS",
-    "CUT_POINTS",
-    "FOUND",
-    "JBJ",
-    "NEAREST",
-    "NEGLIGIBLE_EXPONENT",
-    "NEIGHBOURS",
-    "NOTHING",
-    "SCORE",
-    "SUMS",
-    "A",
-    "B",
-    "Evaluation",
-    "Gauss",
-    "Neighbors",
-    "Scoring",
-    "gauss_for",
-    "matrix_from_pose",
-    "pose_from_matrix",
-    "search_columns",
-]
-
 Neighbors = Literal["direct1", "direct7", "radius"]
 
 # Index of each sum in a row.

@@ -45,8 +45,6 @@ from shmmap_clients.ndt_scan_matcher.matching.result import (
 )
 from shmmap_clients.ndt_scan_matcher.matching.settings import Cut, Limits, Settings, TimeBound, rule_of
 
-__all__ = ["NdtMatcher", "Regularization"]
-
 _REPEATS = 3
 _REACH: Final = {"direct1": 1, "direct7": 7, "radius": 27}
 _SHARED_PLACES: Final = 4  # where four cells meet, each has its own voxel in the same lattice place

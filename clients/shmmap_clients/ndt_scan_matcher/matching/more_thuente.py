@@ -13,8 +13,6 @@ from typing import Final
 
 import numpy as np
 
-__all__ = ["MAX_TRIALS", "line_search"]
-
 MAX_TRIALS: Final = 10
 Search = Generator[float, tuple[float, float], tuple[float, int]]
 _MU: Final = 1e-4  # sufficient decrease, eq. 1.1

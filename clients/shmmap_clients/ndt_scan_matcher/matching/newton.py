@@ -28,19 +28,6 @@ from shmmap_clients.ndt_scan_matcher.matching.evaluation import (
 from shmmap_clients.ndt_scan_matcher.matching.more_thuente import line_search
 from shmmap_clients.ndt_scan_matcher.matching.pose_batch import numpy_step
 
-__all__ = [
-    "VARIANTS",
-    "Ascent",
-    "Step",
-    "StepRule",
-    "Stop",
-    "Variant",
-    "ascend",
-    "climb",
-    "started",
-    "variant_named",
-]
-
 Stop = Literal["step", "step_late", "squared_translation"]
 _BACK: Final = 0.5  # least negated cosine between two opposite steps
 _MAY_LOSE: Final = 0.1  # largest relative loss of score in one steady step

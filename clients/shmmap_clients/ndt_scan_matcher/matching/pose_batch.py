@@ -28,18 +28,6 @@ from shmmap_clients.ndt_scan_matcher.matching.evaluation import (
     Evaluation,
 )
 
-__all__ = [
-    "FLAT",
-    "SINGULAR",
-    "SMALL_ANGLE",
-    "derivatives_of_poses",
-    "evaluations_of",
-    "matrices_from_poses",
-    "newton_step",
-    "numpy_step",
-    "upward_step",
-]
-
 SMALL_ANGLE: Final = 10e-5  # below it, derivatives in the originals take the angle as zero
 # threshold of zero in Eigen's JacobiSVD: as many roundings as the matrix has rows
 SINGULAR: Final = 6 * float(np.finfo(np.float64).eps)

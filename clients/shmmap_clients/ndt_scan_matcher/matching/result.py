@@ -33,19 +33,6 @@ from shmmap import BadRequest
 from shmmap_clients.ndt_scan_matcher.matching.evaluation import gauss_for
 from shmmap_clients.ndt_scan_matcher.matching.settings import Cut
 
-__all__ = [
-    "FAR_POINTS",
-    "Evidence",
-    "Extent",
-    "Result",
-    "TrustLimits",
-    "covariance_of",
-    "default_nvtl",
-    "evidence_of",
-    "extent_of",
-    "oscillations",
-]
-
 FAR_POINTS: Final = 20
 _ANGLE_POINTS: Final = 512  # points evenly over a scan, enough for its angle
 # ndt_scan_matcher.param.yaml of autoware_core: converged_param_nearest_voxel_transformation_likelihood,
@@ -341,6 +328,14 @@ class Result:
     cut: Cut
     no_map: bool
     failed_limits: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        T = self.T_map_base
+        place = ", ".join(f"{axis} {value:.3f}" for axis, value in zip("xyz", T[:3, 3], strict=True))
+        yaw = math.degrees(math.atan2(T[1, 0], T[0, 0]))
+        trust = "trusted" if self.trustworthy else f"not trusted ({', '.join(self.failed_limits)})"
+        found = f"NVTL {self.nvtl:.2f}, {self.iterations} steps, {trust}"
+        return f"<Result at {place} m, yaw {yaw:.2f} deg: {found}>"
 
     @property
     def trustworthy(self) -> bool:

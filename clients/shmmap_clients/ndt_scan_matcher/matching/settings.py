@@ -12,8 +12,6 @@ from shmmap_clients.ndt_scan_matcher.backends.backend import DeviceOptions
 from shmmap_clients.ndt_scan_matcher.matching.evaluation import Neighbors
 from shmmap_clients.ndt_scan_matcher.matching.newton import StepRule, Variant
 
-__all__ = ["VOXEL_BYTES", "Cut", "Limits", "Mode", "Settings", "TimeBound", "rule_of"]
-
 VOXEL_BYTES: Final = 96  # 72 for the Gaussian, the rest for the lattice of a street
 _MAX_POSES: Final = 65_536
 Mode = Literal["single", "coarse_fine"]

@@ -20,20 +20,6 @@ if TYPE_CHECKING:
     from shmmap.client.client import Client
     from shmmap.protocol.messages import Pinned
 
-__all__ = [
-    "add_evict",
-    "add_pin",
-    "add_reload",
-    "add_stop",
-    "add_unpin",
-    "run_evict",
-    "run_pin",
-    "run_reload",
-    "run_stop",
-    "run_unpin",
-]
-
-
 _RELOAD_EXIT = """\
 Exit code: 0; 1 when this user may not do it, 65 bad map: the map before stays, 66 no map there, 69 when no
 daemon answers."""

@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from shmmap.cli.areas import add_area_or_ids, area_from, no_cell_there, print_near_cells
+from shmmap.cli.compiling_lines import saying_what_the_daemon_does
 from shmmap.cli.daemon_address import connect
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb, seconds
 from shmmap.cli.program import add_allow_empty, complain, nothing_found
 from shmmap.cli.screens.output import counted, print_json, print_line
 from shmmap.errors import BadRequest
-from shmmap.lacking import area_text, failure_lines, near_cells_hint, not_covered, unknown_ids
+from shmmap.lacking import PREPARE_HINT, area_text, failure_lines, near_cells_hint, not_covered, unknown_ids
 
 if TYPE_CHECKING:
     import numpy as np
@@ -25,9 +26,7 @@ if TYPE_CHECKING:
     from shmmap.client.cell_set import CellSet
     from shmmap.geometry import Area
 
-__all__ = ["add_parser", "run"]
-
-_FORMATS = ("pcd", "npz")
+_FORMATS = ("pcd", "ply", "npz")
 
 _EXIT = """\
 Exit code: 0; 1 when a cell could not be loaded, or there is no cell or no point (then nothing is written);
@@ -40,16 +39,20 @@ def add_parser(subparsers: Subparsers) -> None:
         subparsers,
         "export",
         run,
-        help="write cells to PCD or NPZ files",
+        help="write cells to PCD, PLY or NPZ files",
         description="Write cells, as the daemon serves them, to one merged file or to one file per cell.  "
-        "Whole cells are written, unless --crop is given.",
+        "Whole cells are written, unless --crop is given.  A layer without points, such as ndt(leaf=2.0), is "
+        "written to one NPZ file per cell.",
         output="cells.outputs.Exported",
         epilog=_EXIT,
     )
     add_area_or_ids(parser)
+    parser.add_argument(
+        "--layer", metavar="SPEC", default="points", help="what to have of each cell (default: points)"
+    )
     parser.add_argument("--crop", action="store_true", help="leave out points outside the area (and --z)")
     out = parser.add_mutually_exclusive_group(required=True)
-    out.add_argument("-o", "--output", metavar="FILE", help="one merged file, .pcd or .npz")
+    out.add_argument("-o", "--output", metavar="FILE", help="one merged file, .pcd, .ply or .npz")
     out.add_argument("--output-dir", metavar="DIR", help="one file per cell, named as the cell")
     parser.add_argument(
         "--format", choices=_FORMATS, help="format of the files (default: as FILE ends; pcd in a DIR)"
@@ -77,32 +80,36 @@ def run(args: argparse.Namespace) -> int:
         raise BadRequest("--crop needs an area", hint="add --circle, --square or --box")
     kind = _format(args)
     with connect(args) as client:
-        if area:
-            found = client.area(area, wait=args.wait, strict=None)
-        else:
-            found = client.selected(args.id, wait=args.wait, strict=None)
+        with saying_what_the_daemon_does(client):
+            if area:
+                found = client.area(area, args.layer, wait=args.wait, strict=None)
+            else:
+                found = client.selected(args.id, args.layer, wait=args.wait, strict=None)
         if not found.complete:
             _complain_of(found, args.wait)
             print_near_cells(near_cells_hint(client, unknown_ids(found.failed)))
             return 1
         written: list[outputs.File] = []
         if found.cells:
+            _refuse_without_points(args, found.cells, kind)
             plan = _plan(args, found.cells, kind)
             for path, _ in plan:
                 if path.exists() and not args.force:
                     raise _exists(path)
             for path, cells in plan:
                 columns = _merged_columns(cells, area if args.crop else None)
-                if len(columns["xyz"]):
+                rows = len(columns["xyz"]) if "xyz" in columns else sum(cell.points for cell in cells)
+                if rows:
                     _write(path, columns, kind, args)
                     ids = [cell.id for cell in cells]
-                    written.append(outputs.File(str(path), len(columns["xyz"]), ids))
+                    written.append(outputs.File(str(path), rows, ids))
         if args.json:
             print_json(outputs.Exported(written))
         else:
             for file in written:
                 cells_text = counted(len(file.cells), "cell")
-                print_line(f"{file.path}: {counted(file.points, 'point')} of {cells_text}")
+                rows_text = counted(file.points, "point" if args.layer == "points" else "row")
+                print_line(f"{file.path}: {rows_text} of {cells_text}")
         if written:
             return 0
         if area is not None and not found.cells:
@@ -119,6 +126,8 @@ def _complain_of(found: CellSet, wait_s: float) -> None:
         complain("shmmap", line)
     for pending in found.pending:
         complain("shmmap", f"{pending.id}: not loaded within {wait_s:g} s")
+    if any(pending.layer != "points" for pending in found.pending):
+        complain("shmmap", "what is pending is still being computed", f"--wait SECONDS; {PREPARE_HINT}")
     if not found.covered:
         complain("shmmap", *not_covered(found))
 
@@ -128,9 +137,19 @@ def _format(args: argparse.Namespace) -> str:
     kind: str = args.format or suffix
     if kind not in _FORMATS:
         raise BadRequest(
-            f"{args.output}: what format is that?", hint="name it .pcd or .npz, or give --format"
+            f"{args.output}: what format is that?", hint="name it .pcd, .ply or .npz, or give --format"
         )
     return kind
+
+
+def _refuse_without_points(args: argparse.Namespace, cells: Sequence[Cell], kind: str) -> None:
+    """Refuse to merge or crop a layer that is no table of points, or to write it as a cloud."""
+    apart = kind == "npz" and args.output is None and not args.crop
+    for cell in cells if not apart else ():
+        if "xyz" not in cell.columns or any(len(one) != cell.points for one in cell.columns.values()):
+            raise BadRequest(
+                f"{cell.layer} is no table of points", hint="write it with --output-dir DIR --format npz"
+            )
 
 
 def _plan(args: argparse.Namespace, cells: Sequence[Cell], kind: str) -> list[tuple[Path, list[Cell]]]:
@@ -189,6 +208,7 @@ def _write(path: Path, columns: dict[str, NDArray[Any]], kind: str, args: argpar
     from shmmap.formats.durable_file import appearing_file, writing_errors
     from shmmap.formats.npz_writer import write_npz
     from shmmap.formats.pcd.writer import write_pcd
+    from shmmap.formats.ply_writer import write_ply
 
     with writing_errors(str(path)):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -196,6 +216,8 @@ def _write(path: Path, columns: dict[str, NDArray[Any]], kind: str, args: argpar
             with appearing_file(path, replace=args.force) as file:
                 if kind == "npz":
                     write_npz(file, columns)
+                elif kind == "ply":
+                    write_ply(file, columns)
                 else:
                     write_pcd(file, columns, encoding=args.encoding)
         except FileExistsError as error:

@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from shmmap.formats.cloud import CloudDescription
     from shmmap.formats.coordinate_system import CoordinateSystem
 
-__all__ = ["add_parser", "run"]
-
 _EXIT = """\
 Exit code: 0; 1 when there is no finite point, 65 bad data (the message has path, byte offset and cause),
 66 no such file, or no cloud in the directory."""

@@ -14,28 +14,6 @@ if TYPE_CHECKING:
     from shmmap.client.cell_set import CellSet
     from shmmap.formats.cloud import CloudDescription
 
-__all__ = [
-    "Bounds",
-    "CloudFile",
-    "Crs",
-    "Directory",
-    "Eviction",
-    "Exported",
-    "FailedLayer",
-    "Field",
-    "File",
-    "Found",
-    "FoundCell",
-    "Outside",
-    "PendingLayer",
-    "Pin",
-    "Pins",
-    "Reload",
-    "ServedMap",
-    "Stop",
-    "UnreadFile",
-]
-
 
 class Reload(msgspec.Struct):
     """Changes of the map found by a reload."""

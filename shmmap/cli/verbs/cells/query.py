@@ -9,7 +9,7 @@ import re
 from typing import TYPE_CHECKING
 
 from shmmap.cli.areas import add_area_or_ids, area_from, no_cell_there, print_near_cells
-from shmmap.cli.compiling_lines import saying_what_the_daemon_compiles
+from shmmap.cli.compiling_lines import saying_what_the_daemon_does
 from shmmap.cli.daemon_address import connect, snapshot
 from shmmap.cli.options import (
     Subparsers,
@@ -33,6 +33,7 @@ from shmmap.cli.screens.output import (
 )
 from shmmap.errors import BadRequest, ShmmapError
 from shmmap.lacking import (
+    PREPARE_HINT,
     empty_layers,
     failure_lines,
     near_cells_hint,
@@ -45,8 +46,6 @@ if TYPE_CHECKING:
     from shmmap.client.cell_set import CellSet
     from shmmap.client.client import Client
     from shmmap.geometry import Area
-
-__all__ = ["add_parser", "held_cell", "run"]
 
 _EXIT = """\
 Codes of failures: unknown_cell, load_failed, load_timeout, over_budget, no_space, offline.
@@ -112,7 +111,7 @@ def run(args: argparse.Namespace) -> int:
         raise BadRequest("--held needs an area", hint="add --circle, --square or --box")
     layers = layers_from(args)
     with connect(args) as client:
-        with saying_what_the_daemon_compiles(client):
+        with saying_what_the_daemon_does(client):
             if area is None:
                 found = client.selected(args.id, layers, wait=args.wait, strict=None)
             elif held_given:
@@ -153,7 +152,8 @@ def _still_pending(args: argparse.Namespace, found: CellSet) -> tuple[str, str]:
             what += ": the daemon compiles kernels, once for this version"
         else:
             what += f": {loaders} at work"
-    return what, "ask again, or wait longer: --wait SECONDS; `shmmap top` shows loads"
+    hint = "ask again, or wait longer: --wait SECONDS; `shmmap top` shows loads"
+    return what, f"{hint}; {PREPARE_HINT}" if any(one.layer != "points" for one in found.pending) else hint
 
 
 def _judge_empty(args: argparse.Namespace, client: Client, area: Area | None, found: CellSet) -> int:

@@ -7,6 +7,7 @@ import argparse
 import contextlib
 import os
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,53 +23,68 @@ from shmmap.cli.screens.output import (
 )
 from shmmap.cli.screens.work_progress import fields_text
 from shmmap.cli.verbs.maps.divide import metres, translation
-from shmmap.errors import BadRequest, ConfigError, MapDataError
+from shmmap.errors import BadRequest, MapDataError, MapMissing, ShmmapError
 from shmmap.formats.durable_file import writing_errors
 
 if TYPE_CHECKING:
     from shmmap.daemon.live.disk.exporting import ExportedVoxels, Format
     from shmmap.daemon.live.disk.maintenance import CheckedMap
 
-__all__ = ["add_export", "add_fsck", "add_reset", "run_fsck"]
-
 
 def _add_directory(parser: argparse.ArgumentParser) -> None:
     """Add ``DIR``."""
     parser.add_argument(
-        "directory", metavar="DIR", help="the directory of the live map, or its name in the daemon's settings"
+        "directory",
+        metavar="DIR",
+        help="the directory of the live map, or its name in the settings or in a daemon that runs",
     )
 
 
 def _directory_from(args: argparse.Namespace) -> str:
-    """Return the map's directory; an argument that is no directory may be the name of a map."""
+    """Return the map's directory; an argument that is no directory may be the name of a map.
+
+    Raises
+    ------
+    MapMissing
+        There is neither a directory nor a live map of that name.
+    """
     given: str = args.directory
     if os.path.isdir(given) or os.sep in given:
         return os.path.abspath(given)
-    return next(filter(os.path.isdir, _places(given)), os.path.abspath(given))
+    known = [(name, path) for name, path in _places() if os.path.isdir(path)]
+    for name, path in known:
+        if name == given:
+            return path
+    names = ", ".join(dict.fromkeys(name for name, _ in known))
+    raise MapMissing(
+        f"there is neither a directory nor a live map {given!r}",
+        hint=f"live maps here: {names}"
+        if names
+        else "name the directory of a live map; no live map is set up",
+    )
 
 
-def _places(name: str) -> list[str]:
-    """Return the directories where a live map of this name may be, by settings and by default."""
+def _places() -> Iterator[tuple[str, str]]:
+    """Yield names and directories of live maps: of the settings, of a daemon that runs, and default ones."""
     from shmmap.daemon.config import installed_config_file, load_config
-    from shmmap.daemon.config_live import SERVICE_STATE, live_directory
+    from shmmap.daemon.config_live import SERVICE_STATE, state_directory
+    from shmmap.doctor.daemon_lists import DaemonLists
+    from shmmap.statistics.reader import read_statistics
 
     config = load_config({}, file=installed_config_file())
-    places = [one.path for one in config.live if one.name == name and one.path]
-    with contextlib.suppress(ConfigError):  # no home directory: no state directory of the user
-        places.append(live_directory(config.instance, name))
-    return [*places, f"{SERVICE_STATE}/{config.instance}/live/{name}"]
+    yield from ((one.name, one.path) for one in config.live if one.path)
+    with contextlib.suppress(ShmmapError, OSError):  # no daemon, which may have been given another directory
+        with DaemonLists() as lists:
+            lists.add_to(served := read_statistics(config.instance, config.shm_dir))
+        yield from ((row.name, row.path) for row in served.live)
+    for state in filter(None, (state_directory(config.instance), f"{SERVICE_STATE}/{config.instance}")):
+        with contextlib.suppress(OSError):
+            yield from ((name, f"{state}/live/{name}") for name in sorted(os.listdir(f"{state}/live")))
 
 
 _FSCK_EXIT = """\
-Exit code: 0 all is well, 65 a file is damaged, cannot be read or is missing (also where that was repaired),
+Exit code: 0 all is well, 65 something is damaged, lost or cannot be read (also where that was repaired),
 66 no live map there, 75 another process works with it (then --read-only looks)."""
-
-_MANIFEST = {
-    "current": "as the files are",
-    "stale": "not as the files are, as after a kill; the daemon rewrites it",
-    "absent": "none, so missing chunks cannot be found; the daemon writes one",
-    "unreadable": "cannot be read, so missing chunks cannot be found",
-}
 
 
 def add_fsck(subparsers: Subparsers) -> None:
@@ -77,7 +93,7 @@ def add_fsck(subparsers: Subparsers) -> None:
         subparsers,
         "fsck",
         run_fsck,
-        help="check the files of a live map",
+        help="check the database of a live map",
         description="Read each chunk of a live map whole, and check it against its checksums and counters.\n"
         "Nothing is changed without --repair, and nothing is ever deleted.",
         output="live.outputs.checked_kind",
@@ -91,15 +107,15 @@ def add_fsck(subparsers: Subparsers) -> None:
     how.add_argument(
         "--repair",
         action="store_true",
-        help="quarantine files that are damaged or cannot be read, and list the good ones in a new manifest",
+        help="make a database of the good chunks, and put the damaged one aside",
     )
     add_json_option(parser)
 
 
 def run_fsck(args: argparse.Namespace) -> int:
-    """Check the files, and repair them if requested."""
+    """Check the database, and repair it if requested."""
     from shmmap.daemon.live.disk.maintenance import check, repair
-    from shmmap.daemon.live.disk.stored_map import opened_folder, opened_folder_to_read
+    from shmmap.daemon.live.disk.stored_map import opened_folder, opened_folder_to_read, require_database
 
     path = _directory_from(args)
     if args.read_only:
@@ -108,6 +124,7 @@ def run_fsck(args: argparse.Namespace) -> int:
     else:
         busy = "--read-only looks at it nevertheless"
         with opened_folder(path, f"stop it; {busy}") as folder:
+            require_database(folder)
             found = check(folder, path)
             if args.repair:
                 with writing_errors(path):
@@ -117,7 +134,8 @@ def run_fsck(args: argparse.Namespace) -> int:
     else:
         _print_fsck(found)
     if not found.good and not args.json and not args.repair:
-        complain("shmmap", f"{path}: not everything that was saved is there", _advice(found))
+        advice = "bring the database back from a copy; or let --repair make one of what is good"
+        complain("shmmap", f"{path}: not everything that was saved is there", advice)
     return 0 if found.good else MapDataError.exit_code
 
 
@@ -139,31 +157,16 @@ def _print_fsck(found: CheckedMap) -> None:
         ("voxels of", f"{found.resolution:g} m in frame {found.frame_id}"),
         ("good", f"{counted(len(found.rows), 'chunk')}, {format_bytes(found.total('bytes'))}"),
         ("voxels", f"{known} known: {occupied} occupied, {free} free"),
-        ("manifest", "rewritten" if found.rewritten else _MANIFEST[found.manifest]),
+        *(("put aside", name) for name in found.aside),
     ]
-    for title, names in (
-        ("unfinished", found.interim),
-        ("quarantined", found.quarantined),
-        ("not a chunk", found.strange),
-    ):
-        lines += [(title, name) for name in names]
+    if found.rebuilt_from:
+        lines.append(("repaired", f"the damaged database is kept as {found.rebuilt_from}"))
     print_pairs(lines)
-    for one in found.damaged:
-        kept = f"; kept as {one.kept_as}" if one.kept_as else ""
-        print_line(f"damaged: {one.file}: {one.reason}{kept}")
-    for name, reason in found.unreadable.items():
-        print_line(f"unreadable: {name}: {reason}")
-    for lost in found.missing:
-        now = f"version {lost.found} is there" if lost.found else "nothing is there"
-        print_line(f"missing: chunk {lost.chunk}: version {lost.version} was saved, {now}")
-
-
-def _advice(found: CheckedMap) -> str:
-    if found.unreadable:
-        return "as root it may be readable; else look at the disk; --repair quarantines what stays unreadable"
     if found.damaged:
-        return "--repair quarantines damaged files: what they had is mapped again, unless a copy is put back"
-    return "put the files back from a copy, or let --repair forget them"
+        print_line(f"damaged: {found.damaged}")
+    for lost in found.lost:
+        now = f"version {lost.found} is there" if lost.found else "nothing is there"
+        print_line(f"lost: chunk {lost.chunk}: version {lost.version} was saved, {now}: {lost.reason}")
 
 
 _EXPORT_EPILOG = """\
@@ -171,8 +174,8 @@ A point lies in the middle of its voxel, in metres; its field `intensity` is the
 is occupied.
 A daemon may go on mapping meanwhile.  What it has not saved yet is in its memory alone, and left out: before
 that, `shmmap live save` has everything saved.
-OUT appears complete or not at all, and a damaged file ends the export.
-Exit code: 0; 1 no such voxel (then nothing is written), 2 wrong usage or OUT exists, 65 a damaged file,
+OUT appears complete or not at all, and a damaged chunk ends the export.
+Exit code: 0; 1 no such voxel (then nothing is written), 2 wrong usage or OUT exists, 65 a damaged chunk,
 66 no live map there, 73 OUT cannot be written."""
 
 
@@ -222,9 +225,9 @@ def _run_export(args: argparse.Namespace) -> int:
 
     path = _directory_from(args)
     began_s = time.monotonic()
-    with opened_folder_to_read(path) as files:
+    with opened_folder_to_read(path) as files, StoredMap(files, path) as stored:
         made = export(
-            StoredMap(files, path),
+            stored,
             args.output,
             _format(args.output),
             voxels=args.voxels,
@@ -236,7 +239,7 @@ def _run_export(args: argparse.Namespace) -> int:
         which = "known" if args.voxels == "both" else args.voxels
         return nothing_found(
             args,
-            f"no {which} voxel in the files of {path}: nothing is written",
+            f"no {which} voxel is saved in {path}: nothing is written",
             "if a daemon maps there now, have it save first: `shmmap live save`",
         )
     seconds = time.monotonic() - began_s
@@ -246,14 +249,12 @@ def _run_export(args: argparse.Namespace) -> int:
         print_json(with_more(made, seconds=seconds))
     else:
         print_pairs([*_export_lines(made), ("time", format_duration(seconds))])
-    if made.quarantined:
-        complain("shmmap", f"left out: {counted(len(made.quarantined), 'damaged file')} in quarantine")
-    if made.missing:
-        named = ", ".join(made.missing[:3]) + (", ..." if len(made.missing) > 3 else "")
+    if made.lost:
+        named = ", ".join(made.lost[:3]) + (", ..." if len(made.lost) > 3 else "")
         complain(
             "shmmap",
-            f"left out: what is lost of {counted(len(made.missing), 'chunk')}: {named}",
-            "`shmmap live fsck` says what is missing",
+            f"left out: what is lost of {counted(len(made.lost), 'chunk')}: {named}",
+            "`shmmap live fsck` says why",
         )
     return 0
 

@@ -12,9 +12,6 @@ from shmmap.cli.json_output import LiveMap, more_of
 if TYPE_CHECKING:
     from shmmap.client.live.chunk_reader import ChunkInfo
 
-__all__ = ["Chunk", "LiveMaps", "Saved", "ShownMap", "checked_kind", "exported_kind", "reset_kind"]
-
-
 TOTALS: Final = ("bytes", "active", "occupied", "free")
 
 

@@ -25,9 +25,6 @@ if TYPE_CHECKING:
     from shmmap.client.live.chunk_reader import ChunkInfo
     from shmmap.protocol.live import LiveMapRow
 
-__all__ = ["add_ls", "add_save", "add_show"]
-
-
 _LS_EXIT = """\
 Exit code: 0, or 69 when no daemon answers."""
 

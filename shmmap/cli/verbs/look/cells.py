@@ -8,8 +8,8 @@ import time
 from typing import TYPE_CHECKING
 
 from shmmap.cli.areas import add_area_options, area_from, around, those_in
-from shmmap.cli.daemon_address import connect, snapshot
-from shmmap.cli.options import Subparsers, add_daemon_options, add_statistics_options, add_verb
+from shmmap.cli.daemon_address import connect, connect_to, snapshot
+from shmmap.cli.options import Subparsers, add_daemon_options, add_verb
 from shmmap.cli.program import add_allow_empty, nothing_found
 from shmmap.cli.screens.output import (
     Column,
@@ -23,26 +23,23 @@ from shmmap.cli.screens.output import (
     rows_text,
     user_name,
 )
-from shmmap.errors import DaemonUnreachable, UnknownCell
+from shmmap.errors import UnknownCell
 from shmmap.lacking import area_text, extent_text, near_cells_hint
 
 if TYPE_CHECKING:
     from shmmap.protocol.messages import ShownCell
     from shmmap.protocol.rows import CellRow, Holder
 
-__all__ = ["add_ls", "add_show", "run_ls", "run_show"]
-
-
 _LS_EXIT = """\
-Exit code: 0, also when nothing is in memory; 1 when an area touches no cell in memory, 69 when the daemon
-is dead or was never started."""
+Exit code: 0, also when nothing is in memory; 1 when an area touches no cell in memory, 69 when no daemon
+answers."""
 
 _COLUMNS = (
     Column("CELL"),
     Column("X", "right", spare=2),
     Column("Y", "right", spare=2),
     Column("SIZE", "right", spare=6),
-    Column("STATE", spare=4),
+    Column("STATE", spare=4, looks={"stale": "yellow", "retired": "magenta", "ahead": "cyan"}),
     Column("LAYER", spare=1),
     Column("ROWS", "right"),
     Column("MEMORY", "right"),
@@ -63,13 +60,11 @@ def add_ls(subparsers: Subparsers) -> None:
         "ls",
         run_ls,
         help="the cells in shared memory",
-        description="List the cells in shared memory, one line for each layer of a cell.  Reads the daemon's "
-        "statistics: works while the daemon is paused (SIGSTOP, a debugger) or hangs; not after "
-        "`shmmap stop`.\n"
+        description="List the cells in shared memory, one line for each layer of a cell.\n"
         "X, Y, SIZE: lower corner and side, metres, map frame.\n"
         "STATE: resident; ahead when it was fetched before a client asked for it, and none has yet; stale "
-        "when a newer version exists that is not loaded yet; retired (in JSON: zombie) when it left service, "
-        "to be freed when no process maps it.\n"
+        "when a newer version exists that is not loaded yet; retired (in JSON: `zombie`) when it left "
+        "service, to be freed when no process maps it.\n"
         "ROWS: points, or what a layer has instead, such as voxels.\n"
         "HITS, LAST USED: how often it was given to clients, and how long ago the last time.\n"
         "LOAD: how long loading took.",
@@ -85,7 +80,7 @@ def add_ls(subparsers: Subparsers) -> None:
     parser.add_argument("--state", choices=_STATES, help="only these")
     add_area_options(parser, parser.add_mutually_exclusive_group(), heights=False)
     add_allow_empty(parser)
-    add_statistics_options(parser)
+    add_daemon_options(parser)
 
 
 def run_ls(args: argparse.Namespace) -> int:
@@ -102,13 +97,14 @@ def run_ls(args: argparse.Namespace) -> int:
 def _list(args: argparse.Namespace) -> int:
     area = area_from(args)
     found, identity = snapshot(args)
-    rows = found.cells
+    with connect_to(args, found) as client:
+        rows = known = client.list_cells()
     there = around(row.box for row in rows)
     if area is not None:
         rows = [rows[index] for index in those_in(area, [row.box for row in rows])]
     nothing_there = there is not None and not rows
     if args.state is not None:
-        rows = [row for row in rows if args.state in (_shown_state(row), row.state)]
+        rows = [row for row in rows if args.state in (row.shown_state, row.state)]
     if args.sort != "id":
         name = {"used": "last_use_monotonic_ns", "load": "load_ns"}.get(args.sort, args.sort)
         rows.sort(key=lambda row: int(getattr(row, name)), reverse=True)
@@ -120,28 +116,18 @@ def _list(args: argparse.Namespace) -> int:
         segments = [
             Segment.of(row, now_ns, id_prefix=identity.id_prefix, instance=identity.instance) for row in rows
         ]
-        print_json(outputs.Listed(found.state, f"{identity.epoch:016x}", found.rows_missing, segments))
+        print_json(outputs.Listed(found.state, f"{identity.epoch:016x}", 0, segments))
     else:
         if rows:
             print_table(_COLUMNS, [_ls_row(row, now_ns) for row in rows])
-        elif not found.cells:
+        elif not known:
             print_line("nothing is in memory: cells are loaded when a client asks for them")
         elif not nothing_there:
             print_line(f"no cell in memory is {args.state}")
-        if found.rows_missing:
-            print_line(f"and {found.rows_missing:,} more that the statistics have no room for")
-    if found.state == "dead":
-        return DaemonUnreachable.exit_code
     if nothing_there and area is not None and there is not None:
         spans = f"those in memory span {extent_text(there)}"
         return nothing_found(args, f"no cell in memory {area_text(area)}; {spans}")
     return 0
-
-
-def _shown_state(row: CellRow) -> str:
-    if row.ahead:
-        return "ahead"
-    return "retired" if row.state == "zombie" else row.state
 
 
 def _whole_seconds(span_s: float) -> str:
@@ -155,7 +141,7 @@ def _ls_row(row: CellRow, now_ns: int) -> list[str]:
         format_metres(row.box[0]),
         format_metres(row.box[1]),
         f"{format_metres(max(row.box[2] - row.box[0], row.box[3] - row.box[1]))} m",
-        _shown_state(row),
+        row.shown_state,
         row.layer,
         f"{row.points:,}",
         format_bytes(row.bytes),
@@ -224,10 +210,9 @@ def _show_lines(cell: ShownCell) -> list[tuple[str, str]]:
 
 
 def _segment_line(segment: CellRow) -> str:
-    state = "retired" if segment.state == "zombie" else segment.state
     rows = rows_text(segment.points, segment.layer)
     return (
-        f"{segment.layer}, {state}, {rows}, {format_bytes(segment.bytes)},"
+        f"{segment.layer}, {segment.shown_state}, {rows}, {format_bytes(segment.bytes)},"
         f" version {segment.version:016x}, {segment.segment}"
     )
 

@@ -15,22 +15,9 @@ from shmmap.cli.screens.top_screen import budget_parts
 from shmmap.cli.verbs.look.tail import HEX_FIELDS
 from shmmap.doctor.verdicts import Finding, cache_verdict
 from shmmap.protocol.messages import ShownCell
-from shmmap.statistics.counters import SPANS
+from shmmap.statistics.counters import LINK_CAUSES, SPANS
 from shmmap.statistics.identity import DaemonIdentity
 from shmmap.statistics.reader import Snapshot
-
-__all__ = [
-    "Clients",
-    "Diagnosis",
-    "Health",
-    "Listed",
-    "Prefetching",
-    "Published",
-    "Shown",
-    "Status",
-    "Top",
-    "json_events",
-]
 
 State: TypeAlias = Annotated[
     str,
@@ -94,6 +81,8 @@ class Published(msgspec.Struct):
     objects_damaged_on_disk: int
     objects_damaged_in_store: int
     fetches_failed: int
+    link_bytes: Annotated[dict[str, int], msgspec.Meta(description="what came over the link, by cause")]
+    link_bytes_per_second: Annotated[int | None, msgspec.Meta(description="greatest rate of the link lately")]
 
     @classmethod
     def of(cls, counters: Mapping[str, int]) -> Published | None:
@@ -121,6 +110,8 @@ class Published(msgspec.Struct):
             counters["objects_damaged_on_disk"],
             counters["objects_damaged_in_store"],
             counters["fetches_failed"],
+            {cause: counters.get(f"link_{cause}_bytes", 0) for cause in LINK_CAUSES},
+            counters.get("link_rate_bytes", 0) or None,
         )
 
 
@@ -236,7 +227,7 @@ class Top(msgspec.Struct):
             count["refused_over_budget"],
             count["refused_quota"],
             [LiveMap.of(row) for row in found.live],
-            [Client.of(client, found.beat_monotonic_ns) for client in found.clients],
+            [Client.of(client, found.beat_monotonic_ns) for client in found.clients or ()],
         )
 
 
@@ -256,7 +247,7 @@ class Listed(msgspec.Struct):
 
     state: str
     epoch: Hex
-    not_listed: Annotated[int, msgspec.Meta(description="segments that the statistics have no room for")]
+    not_listed: Annotated[int, msgspec.Meta(description="0: all segments are listed")]
     cells: list[Segment]
 
 
@@ -326,3 +317,19 @@ def json_events() -> object:
         tag = kind.__struct_config__.tag or "missed"
         kinds.append(msgspec.defstruct(kind.__name__, fields, tag_field="event", tag=tag))
     return Union[tuple(kinds)]  # noqa: UP007
+
+
+class Viewed(msgspec.Struct):
+    """A picture of points."""
+
+    image: str
+    width: int
+    height: int
+    bytes: int
+    points: Annotated[int, msgspec.Meta(description="points in the picture")]
+    parts: Annotated[int, msgspec.Meta(description="cells, files or chunks that were read")]
+    box: Annotated[list[float], msgspec.Meta(description="min_x, min_y, max_x, max_y shown, metres")]
+    metres_per_pixel: float
+    by: str
+    low: Annotated[float, msgspec.Meta(description="value at the start of the colours")]
+    high: Annotated[float, msgspec.Meta(description="value at their end")]

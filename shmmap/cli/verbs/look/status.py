@@ -6,11 +6,11 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Final
 
 from shmmap.cli.areas import moved_by
-from shmmap.cli.daemon_address import connect, snapshot
+from shmmap.cli.daemon_address import connect, lists, snapshot
 from shmmap.cli.options import Subparsers, add_daemon_options, add_statistics_options, add_verb
 from shmmap.cli.screens.output import (
     Column,
@@ -23,24 +23,25 @@ from shmmap.cli.screens.output import (
     print_line,
     print_pairs,
     print_table,
+    state_style,
     user_name,
 )
 from shmmap.cli.screens.status_parts import (
     prefetch_words,
+    prepare_words,
     published_lines,
     since,
     status_lines,
+    taken_bytes,
     uptime_s,
 )
-from shmmap.doctor.verdicts import cache_verdict, outage_so_far
+from shmmap.doctor.verdicts import Finding, cache_verdict, outage_so_far, problems
 from shmmap.errors import DaemonUnreachable
 
 if TYPE_CHECKING:
     from shmmap.protocol.rows import ClientRow
     from shmmap.statistics.identity import DaemonIdentity
     from shmmap.statistics.reader import Snapshot
-
-__all__ = ["add_clients", "add_status", "run_clients", "run_status"]
 
 _STATUS_EXIT = """\
 Exit code: 0, or 69 when the daemon is dead or was never started."""
@@ -55,8 +56,8 @@ def add_status(subparsers: Subparsers) -> None:
         help="state of the daemon: memory, clients, requests, cache size",
         description="Show the state of the daemon: memory, clients, requests, loads, live maps, whether the "
         "cache is large enough, and what was fetched ahead for moving clients.  Reads its statistics in "
-        "shared memory: works while the daemon is paused (SIGSTOP, a debugger) or hangs; not after "
-        "`shmmap stop`.",
+        "shared memory: works while the daemon is paused (SIGSTOP, a debugger) or hangs, but for live maps; "
+        "not after `shmmap stop`.",
         output="look.outputs.Status",
         epilog=_STATUS_EXIT,
     )
@@ -66,31 +67,40 @@ def add_status(subparsers: Subparsers) -> None:
 def run_status(args: argparse.Namespace) -> int:
     """Print the state of the daemon."""
     found, identity = snapshot(args)
+    with lists(args) as asked:
+        asked.add_to(found)
     if args.json:
         from shmmap.cli.verbs.look.outputs import Status
 
         print_json(Status.of(found, identity))
     else:
-        print_pairs(_status_lines(found, identity))
+        print_pairs([*_verdict_lines(problems(found)), *_status_lines(found, identity)])
     return DaemonUnreachable.exit_code if found.state == "dead" else 0
 
 
+def _verdict_lines(known: Sequence[Finding]) -> list[tuple[str, ...]]:
+    """Return one line for each problem, the worst first, with what to do; or that there is none."""
+    if not known:
+        return [("verdict", "ok: clients get what they ask for", state_style("ok"))]
+    lines: list[tuple[str, ...]] = []
+    for one in known:
+        lines.append((_LABELS[one.state], one.fact, state_style(one.state)))
+        if one.advice:
+            lines.append(("", f"-> {one.advice}"))
+    return lines
+
+
+_LABELS: Final = {"fail": "PROBLEM", "warn": "warning"}
+
+
 def _state_text(found: Snapshot, identity: DaemonIdentity) -> str:
-    pid, uptime = identity.pid, format_duration(uptime_s(identity))
-    return {
-        "healthy": f"healthy, pid {pid}, up {uptime}",
-        "starting": f"starting, pid {pid}, for {uptime}: it does not listen yet",
-        "stopped": f"PAUSED, pid {pid}: continue it with `kill -CONT {pid}`",
-        "hung": f"HUNG, pid {pid}: no heartbeat for {format_duration(found.beat_age_s)}",
-        "dead": f"DEAD: pid {pid} crashed or was killed; start it again, it keeps the cells in memory",
-    }[found.state]
+    state = "paused" if found.state == "stopped" else found.state
+    return f"{state}, pid {identity.pid}, up {format_duration(uptime_s(identity))}"
 
 
 def _occasional_lines(count: Mapping[str, int]) -> list[tuple[str, str]]:
     """Return the lines that most daemons do not need: problems, old versions, unusual settings."""
     lines = []
-    if problems := count.get("map_problems", 0):
-        lines.append(("problems", f"{problems:,} in the map: see the daemon's log, or `shmmap reload`"))
     if outside := count.get("cells_outside_box", 0):
         cells = f"{counted(outside, 'cell')} with points outside the cell's box"
         lines.append(("misplaced", f"{cells}: see the daemon's log, or `shmmap inspect` the map"))
@@ -110,7 +120,7 @@ def _occasional_lines(count: Mapping[str, int]) -> list[tuple[str, str]]:
 
 def _status_lines(found: Snapshot, identity: DaemonIdentity) -> list[tuple[str, str]]:
     count = found.counters
-    used = count["bytes_resident"] + count["bytes_zombie"] + count["bytes_reserved"]
+    used = taken_bytes(count)
     budget = count["budget_bytes"]
     share = f" ({100 * used / budget:.0f} %)" if budget else ""
     asked = count["hits"] + count["misses"]
@@ -118,7 +128,7 @@ def _status_lines(found: Snapshot, identity: DaemonIdentity) -> list[tuple[str, 
         ("daemon", _state_text(found, identity)),
         ("instance", f"{identity.instance} (shmmap {identity.library_version})"),
         ("endpoint", identity.endpoint),
-        ("map", f"{identity.map_path}, {count['map_cells']:,} cells, version {identity.map_version:016x}"),
+        ("map", _map_text(identity, count)),
         ("memory", f"{format_bytes(used)} taken of {format_bytes(budget)}{share} in {identity.shm_dir}"),
         ("resident", f"{count['cells_resident']:,} segments, {format_bytes(count['bytes_resident'])}"),
         ("in use", f"{format_bytes(count['bytes_pinned'])} mapped by clients"),
@@ -152,13 +162,14 @@ def _status_lines(found: Snapshot, identity: DaemonIdentity) -> list[tuple[str, 
     ]
     if count["loads_failed"]:
         lines.append(("", "`shmmap doctor` names the cells that fail"))
+    if identity.live and not found.live:
+        lines.append(("live", f"{', '.join(identity.live.split())}: the daemon does not answer"))
     lines += status_lines(found.live, count.get("live_restarts", 0))
-    verdict = cache_verdict(count)
-    lines.append(("cache", verdict.text))
-    if verdict.hint:
-        lines.append(("", verdict.hint))
+    lines.append(("cache", cache_verdict(count).text))
     if words := prefetch_words(count):
         lines.append(("prefetch", ", ".join(text for text, _trouble in words)))
+    if prepared := prepare_words(count, identity.prepare):
+        lines.append(("prepare", prepared))
     if count["refused_quota"]:
         over = (
             f"{count['refused_quota']:,} cells refused since the start: a client asked for more than its part"
@@ -167,21 +178,27 @@ def _status_lines(found: Snapshot, identity: DaemonIdentity) -> list[tuple[str, 
     return lines
 
 
+def _map_text(identity: DaemonIdentity, count: Mapping[str, int]) -> str:
+    if not identity.map_path:
+        return "none: this daemon serves live maps alone"
+    return f"{identity.map_path}, {counted(count['map_cells'], 'cell')}, version {identity.map_version:016x}"
+
+
 _CLIENTS_EXIT = """\
 Exit code: 0, or 69 when no daemon answers."""
 
 _CLIENT_COLUMNS = (
     Column("CLIENT"),
-    Column("PID", "right"),
-    Column("USER", spare=2),
-    Column("CELLS", "right"),
+    Column("PID", "right", spare=2),
+    Column("USER", spare=5),
+    Column("CELLS", "right", spare=3),
     Column("GIVEN", "right"),
-    Column("MAPPED", "right"),
-    Column("OUTDATED", "right", spare=1),
-    Column("REQUESTS", "right", spare=4),
-    Column("IDLE", "right", spare=5),
-    Column("AT", spare=3),
-    Column("COMMAND", spare=6),
+    Column("MAPPED", "right", spare=1),
+    Column("OUTDATED", "right", spare=4),
+    Column("REQUESTS", "right", spare=7),
+    Column("IDLE", "right", spare=8),
+    Column("AT", spare=6),
+    Column("COMMAND", spare=9),
 )
 
 

@@ -27,8 +27,6 @@ from shmmap.statistics.counters import TURN_KINDS
 if TYPE_CHECKING:
     from shmmap.client.event_stream import Happening
 
-__all__ = ["add_parser", "run"]
-
 _EXIT = """\
 With --json, one object a line.  Live on a terminal or with --follow; else it ends after the events that
 the daemon has kept.
@@ -76,14 +74,15 @@ def run(args: argparse.Namespace) -> int:
     """Print events until interrupted."""
     from shmmap.client.event_stream import EventStream
 
-    follow = sys.stdout.isatty() if args.follow is None else args.follow
+    on_terminal = sys.stdout.isatty()  # asked before anything is shown: afterwards it may be gone
+    follow = on_terminal if args.follow is None else args.follow
     show = _print_json if args.json else _print_text
     deadlines = {} if args.timeout is None else {"timeout": args.timeout}
     with EventStream(endpoint(args), since=args.since, name="shmmap tail", **deadlines) as stream:
         while (happening := stream.next(0.0)) is not None:
             show(happening)
         sys.stdout.flush()
-        on_terminal, said = sys.stdout.isatty(), False
+        said = False
         while follow:
             check_terminal(was_there=on_terminal)
             happening = stream.next(SILENT_S)

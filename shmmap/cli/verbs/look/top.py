@@ -1,32 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap top``: live view of memory, latency and clients, from the daemon's statistics alone."""
+"""``shmmap top``: live view of memory, latency and clients."""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import os
 import shutil
 import signal
 import sys
-import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from types import FrameType
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
-from shmmap.cli.daemon_address import locate, snapshot
+from shmmap.cli.daemon_address import lists, locate, snapshot
 from shmmap.cli.options import Subparsers, add_statistics_options, add_verb, seconds
 from shmmap.cli.program import check_terminal
-from shmmap.cli.screens.output import print_json, print_line, printable
+from shmmap.cli.screens.output import Line, print_json, print_styled
 from shmmap.errors import DaemonUnreachable
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
-    from shmmap.cli.screens.top_screen import Line
+    from shmmap.doctor.daemon_lists import DaemonLists
+    from shmmap.statistics.identity import DaemonIdentity
     from shmmap.statistics.reader import Snapshot, StatisticsReader
-
-__all__ = ["add_parser", "run"]
 
 _EXIT = """\
 Exit code: 0, or 69 when the daemon is dead or was never started."""
@@ -45,10 +42,14 @@ def add_parser(subparsers: Subparsers) -> None:
         run,
         help="live view: memory, latency, clients",
         description="Show how the memory budget is used, how many of the cells asked for were in memory, "
-        "latencies, loads, evictions, refusals, live maps and clients.  Live on a terminal, once in a pipe.\n"
-        "Budget: in use (mapped by clients; not `shmmap pin`), idle (in memory, mapped by no client), "
+        "latencies, loads, evictions, refusals, live maps and clients.  Live on a terminal, as much as "
+        "there is room for, what matters first; once and all of it in a pipe.  While the daemon is paused "
+        "(SIGSTOP, a debugger) or hangs, clients and live maps are missing.\n"
+        "Keys: j and k (or arrows) scroll the clients, s sorts them, q ends.  The lines of blocks are what "
+        "was seen since the start: memory and hits from 0 to 100 %, waits up to the longest mean wait.\n"
+        "Memory: in use (mapped by clients; not `shmmap pin`), idle (in memory, mapped by no client), "
         "retired (out of service, freed when no process maps it), loading (reserved for loads under way), "
-        "statistics (what this view reads), free.\n"
+        "statistics (what `shmmap health` reads), free.\n"
         "Requests: the daemon's own time for one.  Load waits: how long clients waited for loads.  "
         "Load time: of one cell, from when a loader was given it; below it the loaders' own time for points "
         "out of the map's files, for layers computed, and for layers out of the disk cache.\n"
@@ -71,21 +72,27 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Show one screen, or update it until interrupted."""
+    found, identity = snapshot(args)
+    with lists(args, "shmmap top") as asked:
+        return _show(args, found, identity, asked)
+
+
+def _show(args: argparse.Namespace, found: Snapshot, identity: DaemonIdentity, asked: DaemonLists) -> int:
     from shmmap.cli.screens.top_screen import screen
     from shmmap.statistics.reader import StatisticsReader
 
-    found, identity = snapshot(args)
+    asked.add_to(found, clients=True)
     if args.json:
         from shmmap.cli.verbs.look.outputs import Top
 
         print_json(Top.of(found))
-    elif args.once or not sys.stdout.isatty():
+    elif args.once or not sys.stdout.isatty() or os.environ.get("TERM") == "dumb":
         width = shutil.get_terminal_size((PIPE_WIDTH, 40)).columns
-        for line in screen(found, identity, width=width, max_clients=256):
-            print_line("".join(text for text, _style in line).rstrip())
+        for line in screen(found, identity, width=width):
+            print_styled(line)
     else:
         with StatisticsReader(*locate(args)) as reader:
-            return _live(reader, max(args.interval, SHORTEST_S))
+            return _live(reader, asked, max(args.interval, SHORTEST_S))
     return DaemonUnreachable.exit_code if found.state == "dead" else 0
 
 
@@ -110,55 +117,53 @@ def _ended_by_signals() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _live(reader: StatisticsReader, interval_s: float) -> int:
-    """Show the screen until interrupted, then restore the terminal."""
-    from rich.console import Console
-    from rich.live import Live
+def _live(reader: StatisticsReader, asked: DaemonLists, interval_s: float) -> int:
+    """Show the screen until `q` or a signal, then restore the terminal."""
+    from shmmap.cli.screens.full_screen import FullScreen
 
-    console = Console(highlight=False)
-    earlier: deque[Snapshot] = deque()
+    seen = _Seen()
     try:
-        with (
-            _ended_by_signals(),
-            Live(console=console, screen=True, auto_refresh=False, transient=True) as live,
-        ):
+        with _ended_by_signals(), FullScreen() as terminal:
             while True:
                 check_terminal(was_there=True)
-                found = reader.snapshot(cells=False)
-                live.update(_render(found, earlier, console), refresh=True)
-                time.sleep(interval_s)
+                seen.view.keys = terminal.has_keys
+                asked.add_to(found := reader.snapshot(), clients=True)
+                terminal.draw(seen.lines(found, *terminal.size))
+                for key in terminal.keys(interval_s):
+                    if key == "q":
+                        return 0
+                    seen.view.press(key)
     except KeyboardInterrupt:
         return 0
     except _Ended as ended:
         return 128 + ended.number
 
 
-def _render(found: Snapshot, earlier: deque[Snapshot], console: Console) -> Any:
-    from rich.console import Group
-    from rich.text import Text
+class _Seen:
+    """The snapshots seen so far: all in short, those of the last seconds whole."""
 
-    from shmmap.cli.screens.top_screen import screen
+    def __init__(self) -> None:
+        from shmmap.cli.screens.history import History
+        from shmmap.cli.screens.top_screen import View
 
-    if found.identity is None:
-        earlier.clear()
-        return Text("no daemon runs; waiting for one (Ctrl-C ends)", style="bold yellow")
-    while len(earlier) > 1 and found.beat_monotonic_ns - earlier[1].beat_monotonic_ns > LATENCY_SPAN_S * 1e9:
-        earlier.popleft()
-    width, height = console.size
-    lines = screen(
-        found,
-        found.identity,
-        width=width,
-        max_clients=max(height - 24 - 2 * len(found.live), 1),
-        earlier=earlier[0] if earlier else None,
-    )
-    if not earlier or found.beat_monotonic_ns - earlier[-1].beat_monotonic_ns > 1e9:
-        earlier.append(found)
-    return Group(*(_styled(line) for line in lines[: height - 1]))
+        self.view = View(history=History())
+        self._recent: deque[Snapshot] = deque()
 
+    def lines(self, found: Snapshot, width: int, height: int) -> Sequence[Line]:
+        """Return the screen for a new snapshot."""
+        from shmmap.cli.screens.top_screen import screen
 
-def _styled(line: Line) -> Any:
-    from rich.text import Text
-
-    pieces = [(printable(text), style) for text, style in line]
-    return Text.assemble(*pieces, no_wrap=True, overflow="ellipsis")
+        recent = self._recent
+        if found.identity is None:
+            recent.clear()
+            return [[("no daemon runs; waiting for one (Ctrl-C ends)"[:width], "bold yellow")]]
+        if self.view.history is not None:
+            self.view.history.add(found)
+        while (
+            len(recent) > 1 and found.beat_monotonic_ns - recent[1].beat_monotonic_ns > LATENCY_SPAN_S * 1e9
+        ):
+            recent.popleft()
+        self.view.earlier = recent[0] if recent else None
+        if not recent or found.beat_monotonic_ns - recent[-1].beat_monotonic_ns > 1e9:
+            recent.append(found)
+        return screen(found, found.identity, width=width, height=height, view=self.view)

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from shmmap.dividing.merge import MergedCloud
     from shmmap.origin.map_report import DividedMap
 
-__all__ = ["add_divide", "add_merge", "metres", "run_divide", "run_merge", "translation"]
-
 _DIVIDE_EPILOG = """\
 IN is a file (.pcd in every encoding, .las .laz .copc.laz, .ply .pts .xyz .xyzn .xyzrgb, or a table of
 numbers: .txt .csv .asc) or a directory of files, tables left out; all together become one map.  Files may
@@ -145,7 +143,7 @@ def run_divide(args: argparse.Namespace) -> int:
         complain("shmmap", "interrupted", "the same command with --resume continues")
         raise
     seconds = time.monotonic() - began_s
-    print_result(made, _divided_lines(made), seconds=seconds, as_json=args.json)
+    print_result(made, _divided_lines(made, checked=args.check), seconds=seconds, as_json=args.json)
     return 0
 
 
@@ -174,7 +172,7 @@ def translation(text: str) -> Translation:
     return x, y, z
 
 
-def _divided_lines(made: DividedMap) -> list[tuple[str, str]]:
+def _divided_lines(made: DividedMap, *, checked: bool) -> list[tuple[str, str]]:
     left_out = f", {made.dropped:,} left out" if made.dropped else ""
     lines = [
         ("map", made.path),
@@ -182,6 +180,8 @@ def _divided_lines(made: DividedMap) -> list[tuple[str, str]]:
         ("points", f"{made.points:,} of {made.points_read:,} read{left_out}"),
         ("fields", fields_text(made.fields)),
     ]
+    if checked:
+        lines.append(("check", f"passed: {made.points:,} points read back, each in its cell"))
     if made.crs:
         lines.append(("crs", made.crs))
     if made.resumed_points:

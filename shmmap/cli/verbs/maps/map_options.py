@@ -22,25 +22,6 @@ if TYPE_CHECKING:
     from shmmap.prepare.run import Failure
     from shmmap.publishing.signing import MapSigner
 
-__all__ = [
-    "URL_HELP",
-    "add_map_options",
-    "add_sign_option",
-    "add_sole_publisher_option",
-    "add_store_options",
-    "add_trust_option",
-    "cache_directory",
-    "failure_rows",
-    "origin_at",
-    "print_failures",
-    "progress_on_stderr",
-    "refuse_map_options",
-    "signer_at",
-    "store_at",
-    "verified_at",
-    "worker_count",
-]
-
 _SHOWN_FAILURES: Final = 20
 
 

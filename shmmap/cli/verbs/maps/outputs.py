@@ -9,22 +9,6 @@ import msgspec
 
 from shmmap.cli.json_output import Failure, Hex, more_of
 
-__all__ = [
-    "Fetched",
-    "Joined",
-    "Prepared",
-    "PublishedMap",
-    "Refreshed",
-    "RolledBack",
-    "Slice",
-    "Version",
-    "Versions",
-    "divided_kind",
-    "merged_kind",
-    "pruned_kind",
-    "rotated_kind",
-]
-
 
 def divided_kind() -> object:
     """Return the struct that ``divide --json`` prints."""

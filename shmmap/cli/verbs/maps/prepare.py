@@ -47,8 +47,6 @@ from shmmap.errors import BadRequest
 if TYPE_CHECKING:
     from shmmap.publishing.slicing import Sliced
 
-__all__ = ["add_parser", "run"]
-
 _EPILOG = """\
 Layers computed before are kept; a stopped run, started again, continues where it was.  After a map was
 copied or its files touched, its layers are recognised by the files' contents.

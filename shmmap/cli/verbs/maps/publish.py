@@ -47,8 +47,6 @@ from shmmap.errors import BadRequest
 if TYPE_CHECKING:
     from shmmap.publishing.publish import Published
 
-__all__ = ["add_parser", "run"]
-
 _EPILOG = """\
 URL is s3://BUCKET/PATH, gs://BUCKET/PATH, az://CONTAINER/PATH, file:///DIR or a directory, which any web
 server can serve.  Credentials come from the environment, from $CREDENTIALS_DIRECTORY, or from a profile.

@@ -43,8 +43,6 @@ if TYPE_CHECKING:
     from shmmap.progress import Progress
     from shmmap.publishing.signing import MapSigner
 
-__all__ = ["add_fetch", "add_versions", "run_fetch", "run_versions"]
-
 _VERSIONS_EPILOG = """\
 --rollback gives an old version's content a new number: vehicles never go back to a lower one.
 With a web server, versions that were never served cannot be listed.
@@ -59,7 +57,7 @@ def add_versions(subparsers: Subparsers) -> None:
         subparsers,
         "versions",
         run_versions,
-        help="list a published map's versions, go back to one, remove old ones",
+        help="a published map's versions: list, go back, remove old ones",
         description="List the versions of a published map, go back to one, or remove old ones.",
         output="maps.outputs.Versions maps.outputs.RolledBack maps.outputs.Refreshed"
         " maps.outputs.rotated_kind maps.outputs.pruned_kind",

@@ -12,9 +12,6 @@ from shmmap.cli.options import Subparsers, add_json_option, add_verb
 from shmmap.cli.screens.output import print_json, print_line, print_pairs
 from shmmap.errors import InternalError
 
-__all__ = ["add_cpp", "add_version", "installed_version", "prefix", "run_cpp", "run_version"]
-
-
 _EXIT = """\
 Exit code: 0."""
 

@@ -12,9 +12,6 @@ from shmmap.cli.options import Subparsers, add_json_option, add_verb
 from shmmap.cli.screens.output import print_json, print_line
 from shmmap.errors import BadRequest, CannotWrite, ConfigError, MapMissing
 
-__all__ = ["add_parser", "run_check", "run_init", "run_show"]
-
-
 _CHECK_EXIT = """\
 Exit code: 0 good, 66 no map there, 78 a mistake: the codes that the daemon would exit with."""
 

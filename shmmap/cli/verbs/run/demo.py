@@ -8,7 +8,7 @@ import os
 import tempfile
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from shmmap.cli.options import Subparsers, add_json_option, add_verb
 from shmmap.cli.screens.output import print_json, print_line
@@ -17,8 +17,6 @@ from shmmap.errors import BadRequest, CannotWrite
 if TYPE_CHECKING:
     from shmmap.cli.screens.demo import DemoReport
     from shmmap.demo.program import Progress
-
-__all__ = ["add_parser", "run"]
 
 _JSON = """\
   {"town": {"cells", "points", "file_bytes", "build_s"},
@@ -31,7 +29,7 @@ _JSON = """\
    "localization": {"scans", "trustworthy", "error_m", "error_max_m": from the truth, mean and
                     largest, "first_pose_s": from starting the daemon, and then shmmap-ndt}
                    or null,
-   "svg": path, "seconds"}
+   "svg", "png": paths of the pictures, of cells and of points, "seconds"}
   DRIVE: {"consumers", "processes": with the daemon and its workers,
           "cells", "points", "map_bytes": of one consumer's window,
           "start_s": until all have their first window,
@@ -41,14 +39,16 @@ _JSON = """\
           "process_bytes": memory of the processes without shared memory,
           "private_bytes": of it, pages that one process alone maps,
           "shm_bytes": shared memory, counted once, "total_bytes": both}
-  With --live instead of all this: {"scans", "points", "length_m", "budget_bytes", "mapping_s",
-  "mapper_killed_at": scan, "mapper_resumed_at", "daemon_killed_at", "daemon_down_s",
-  "daemon_chunks": that it found in memory, "evicted", "came_back": how often a chunk left memory,
-  and came into it again, "max_bytes": memory of chunks in service,
-  "active", "active_bytes": known voxels in memory in the end, and their memory,
-  "chunks", "file_bytes": of the map on disk, "voxels", "differing": compared with a map without
-  bounds, "svg", "seconds"}
-  Exit code 1 where a scan is not to be trusted or a voxel differs."""
+  Exit code 1 where a scan is not to be trusted."""
+
+_GONE: Final = {
+    "full": (
+        "benchmarks measure what it did",
+        "`python -m tests.benchmarks.memory` and `python -m tests.benchmarks.three_programs`",
+    ),
+    "live": ("an example maps a drive", "`python3 clients/examples/live_drive.py DIR`"),
+}
+"""Options of earlier versions: what does it now, and how."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -60,14 +60,13 @@ def add_parser(subparsers: Subparsers) -> None:
         help="see it work: no map needed, about a minute",
         description="Build a town and drive through it with one process, then with eight: each with a private"
         " copy of the map, then all on one copy that shmmap shares.  Kill the daemon, and see the processes"
-        " continue.  Localize simulated LiDAR scans, and compare the poses with the true ones.  With"
-        " --live: map a drive.",
+        " continue.  Localize simulated LiDAR scans, and compare the poses with the true ones.",
         json=_JSON,
     )
     parser.add_argument(
         "--svg",
         metavar="FILE",
-        help="where the picture goes (default: ./shmmap-demo.svg, with --live ./shmmap-demo-live.svg)",
+        help="where the picture goes (default: ./shmmap-demo.svg)",
     )
     parser.add_argument("--keep-map", metavar="DIR", help="build the map in DIR, and leave it there")
     parser.add_argument(
@@ -76,13 +75,8 @@ def add_parser(subparsers: Subparsers) -> None:
         type=_density,
         help="points per square metre of ground, 2 to 1000; fewer are quicker (default: 100, or what fits)",
     )
-    parser.add_argument(
-        "--live",
-        action="store_true",
-        help="map a drive into a live map with too little memory, and kill daemon and mapping program on the"
-        " way: no voxel is lost (less than a minute)",
-    )
-    parser.add_argument("--full", action="store_true", help=argparse.SUPPRESS)  # options of earlier versions
+    for option in _GONE:
+        parser.add_argument(f"--{option}", action="store_true", help=argparse.SUPPRESS)
     add_json_option(parser)
 
 
@@ -101,29 +95,36 @@ def run(args: argparse.Namespace) -> int:
     from shmmap.cli.screens.demo import print_report, progress_for
     from shmmap.processes.interrupts import signals_interrupt
 
-    if args.full:
-        raise BadRequest(
-            "demo has no --full any more: benchmarks measure what it did",
-            hint="in the source tree: python -m tests.benchmarks.memory, and for three programs side by side"
-            " python -m tests.benchmarks.three_programs",
-        )
-    if args.live and (args.keep_map or args.density):
-        raise BadRequest("--live drives in a town of its own", hint="leave out --keep-map and --density")
-    picture = _picture_path(args.svg, "shmmap-demo-live.svg" if args.live else "shmmap-demo.svg")
+    for option, (message, hint) in _GONE.items():
+        if getattr(args, option):
+            raise BadRequest(
+                f"demo has no --{option} any more: {message}", hint=f"in the source tree: {hint}"
+            )
+    picture = _picture_path(args.svg)
     started_s = time.monotonic()
     if not args.json:
         _note_of_compiling()
     with signals_interrupt(), progress_for(quiet=args.json) as progress:
-        report = (_drive_live if args.live else _drive)(args, progress)
+        report = _drive(args, progress)
     duration_s = time.monotonic() - started_s
     picture.write_text(report.picture_svg, encoding="utf-8")
+    points = picture.with_suffix(".png")
+    if report.picture_png and points != picture:
+        points.write_bytes(report.picture_png)
     if args.json:
-        print_json({**report.document, "svg": str(picture), "seconds": round(duration_s, 3)})
+        pictures = {"svg": str(picture), **({"png": str(points)} if report.picture_png else {})}
+        print_json({**report.document, **pictures, "seconds": round(duration_s, 3)})
     else:
-        near = os.path.relpath(picture)
-        print_report(report, str(picture) if near.startswith("..") else near, duration_s)
+        print_report(report, _shown(picture), duration_s)
         if args.keep_map:
             print_line(f"Serve the town yourself: shmmap serve {args.keep_map}")
+        if report.picture_png:
+            from shmmap.demo.demo_town import PICTURE_FROM
+
+            place = args.keep_map or "TOWN"
+            how = "Draw" if args.keep_map else "With --keep-map TOWN, draw"
+            print_line(f"The points: {_shown(points)}.  {how} them yourself:")
+            print_line(f"  shmmap view {place} --from {PICTURE_FROM} --image {_shown(points)}")
     return 0 if report.passed else 1
 
 
@@ -151,18 +152,9 @@ def _drive(args: argparse.Namespace, progress: Progress) -> DemoReport:
     return town_report(run_demo(settings, progress, map_dir=args.keep_map))
 
 
-def _drive_live(args: argparse.Namespace, progress: Progress) -> DemoReport:
-    """Drive while a live map is recorded, and check that no voxel was lost."""
-    from shmmap.cli.screens.demo import live_report
-    from shmmap.demo.live_drive import LiveDriveSettings, run_live_drive
-
-    del args
-    return live_report(run_live_drive(LiveDriveSettings(), progress))
-
-
-def _picture_path(named: str | None, usual: str) -> Path:
+def _picture_path(named: str | None) -> Path:
     """Return the path of the picture, checked before the work begins."""
-    path = Path(named or usual).absolute()
+    path = Path(named or "shmmap-demo.svg").absolute()
     if (
         path.parent.is_dir()
         and not path.is_dir()
@@ -172,3 +164,9 @@ def _picture_path(named: str | None, usual: str) -> Path:
     if named:
         raise CannotWrite(f"{path} cannot be written", hint="give another --svg FILE")
     return Path(tempfile.mkdtemp(prefix="shmmap-"), path.name)  # a name in /tmp could be another's link
+
+
+def _shown(path: Path) -> str:
+    """Return a path as the user sees it from here."""
+    near = os.path.relpath(path)
+    return str(path) if near.startswith("..") else near

@@ -9,8 +9,6 @@ import msgspec
 
 from shmmap.cli.json_output import more_of
 
-__all__ = ["Checked", "Setting", "Settings", "versions_kind"]
-
 
 class Setting(msgspec.Struct):
     """A setting, and its source: FILE:LINE, a variable, or ``default``."""

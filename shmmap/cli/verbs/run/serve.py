@@ -10,8 +10,6 @@ from shmmap.cli.options import Subparsers, add_verb
 from shmmap.daemon.config import DROPPED, RENAMED, ROWS, SECTIONS, load_config, option_of
 from shmmap.daemon.config_table import Row
 
-__all__ = ["add_parser", "run"]
-
 _EPILOG = """\
 Settings come from FILE, then from SHMMAP_* variables (SHMMAP_BUDGET=2G), then from options.
 MAP is a directory in Autoware's divided format (PCD files and pointcloud_map_metadata.yaml, beside
@@ -68,6 +66,13 @@ def _add_option(group: argparse._ActionsContainer, row: Row) -> None:
         group.add_argument(row.name, metavar=row.metavar, nargs="?", help=words)
     elif isinstance(row.default, bool):
         group.add_argument(option_of(row.name), action="store_true", default=None, help=words)
+    elif isinstance(row.default, tuple):
+        group.add_argument(
+            option_of(row.name),
+            metavar=row.metavar,
+            action="append",
+            help=f"{words}; may be given again",
+        )
     else:
         group.add_argument(
             option_of(row.name),

@@ -16,8 +16,6 @@ from shmmap.errors import BadRequest, ConfigError
 if TYPE_CHECKING:
     from shmmap.service.installation import PlannedFile
 
-__all__ = ["add_parser", "run_install", "run_print"]
-
 _INSTALL = """\
 Writes units, the account `shmmap`, directories and /etc/shmmap/shmmap.toml, and starts nothing.  Units
 are replaced (changes belong in drop-ins: `systemctl edit shmmapd`), a configuration that is there is kept.

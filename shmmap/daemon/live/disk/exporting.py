@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Export the voxels of a live map's files as a cloud, or as a divided map that can be served.
+"""Export the voxels of a saved live map as a cloud, or as a divided map that can be served.
 
 A point lies at the centre of its voxel.  Its ``intensity`` is the probability that the voxel is occupied.
 Chunks are read and written one by one.
@@ -16,11 +16,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.chunks.chunk_file import ChunkFileHeader
 from shmmap.chunks.layout import ChunkView
 from shmmap.chunks.occupancy import UNIT
 from shmmap.chunks.voxels import ChunkKey, voxel_centers, voxels_of
-from shmmap.daemon.live.disk.map_record import MANIFEST, Row
+from shmmap.daemon.live.disk.map_record import Row
 from shmmap.daemon.live.disk.stored_map import StoredMap
 from shmmap.dividing.divide import divide
 from shmmap.dividing.frame import Frame, Translation, frame_between
@@ -32,8 +31,6 @@ from shmmap.formats.durable_file import appearing_file, writing_errors
 from shmmap.formats.pcd.writer import pcd_header
 from shmmap.formats.ply_header import ply_header
 from shmmap.quantities import counted
-
-__all__ = ["ExportedVoxels", "Format", "Voxels", "export"]
 
 Format = Literal["ply", "pcd", "map"]
 Voxels = Literal["occupied", "free", "both"]
@@ -57,10 +54,8 @@ class ExportedVoxels(msgspec.Struct, frozen=True):
         Offset from exported points to that frame, metres.
     fields
         Names and dtypes of the columns.
-    quarantined
-        Files left out because they were quarantined before.
-    missing
-        Chunks of which something that was saved is lost.
+    lost
+        Chunks of which something that was saved is lost, and left out.
     """
 
     path: str
@@ -72,8 +67,7 @@ class ExportedVoxels(msgspec.Struct, frozen=True):
     frame_id: str
     origin: tuple[float, float, float]
     fields: list[tuple[str, str]]
-    quarantined: list[str]
-    missing: list[str]
+    lost: list[str]
 
 
 def export(
@@ -106,7 +100,7 @@ def export(
     BadRequest
         ``out`` exists, or a setting is invalid.
     MapDataError
-        A chunk's file or the manifest is damaged; or there are no voxels, and something is lost.
+        A chunk is damaged; or there are no voxels, and something is lost.
     CannotWrite
         The disk is full or not writable.
     """
@@ -116,14 +110,13 @@ def export(
         check_output_directory(path, force=force)
     elif os.path.isdir(path) or (os.path.lexists(path) and not force):
         raise BadRequest(f"{path} exists", hint="give another name, or --force to overwrite a file")
-    headers = {key: stored.header(key) for key in stored.chunks}
-    keys = _keys(headers, voxels)
-    missing = _missing(stored, headers)
-    if not keys and missing:
+    keys = _keys(stored.rows, voxels)
+    lost = [key.text for key in sorted(stored.lost)]
+    if not keys and lost:
         raise MapDataError(
-            f"no {voxels} voxel is left, and something is lost of {counted(len(missing), 'chunk')}",
+            f"no {voxels} voxel is left, and something is lost of {counted(len(lost), 'chunk')}",
             path=stored.path,
-            hint="`shmmap live fsck` names what is missing",
+            hint="`shmmap live fsck` names what is lost",
         )
     if not keys:
         return None
@@ -158,39 +151,21 @@ def export(
         frame_id=stored.settings.frame_id,
         origin=origin,
         fields=fields,
-        quarantined=stored.names.quarantined,
-        missing=missing,
+        lost=lost,
     )
 
 
 # --- which voxels -----------------------------------------------------------------------------------
 
 
-def _missing(stored: StoredMap, headers: dict[ChunkKey, ChunkFileHeader]) -> list[str]:
-    """Return the chunks of which something that was saved is lost."""
-    if stored.manifest_error:
-        raise MapDataError(
-            f"it cannot be seen whether chunks are missing: {stored.manifest_error}",
-            path=os.path.join(stored.path, MANIFEST),
-            hint="a daemon writes it again, and so does `shmmap live fsck --repair`",
-        )
-    rows = {key: Row.of(header) for key, header in headers.items()}
-    lost = stored.listed.lost(rows) if stored.listed is not None else {}
-    return [key.text for key in lost]
+def _keys(rows: dict[ChunkKey, Row], voxels: Voxels) -> list[ChunkKey]:
+    """Return the chunks that contain such voxels, in order."""
 
-
-def _keys(headers: dict[ChunkKey, ChunkFileHeader], voxels: Voxels) -> list[ChunkKey]:
-    """Return the chunks that contain such voxels, according to their files' headers."""
-
-    def has_some(header: ChunkFileHeader) -> bool:
-        counted = {
-            "occupied": header.occupied,
-            "free": header.free,
-            "both": header.occupied + header.free,
-        }
+    def has_some(row: Row) -> bool:
+        counted = {"occupied": row.occupied, "free": row.free, "both": row.occupied + row.free}
         return counted[voxels] > 0
 
-    return [key for key, header in headers.items() if has_some(header)]
+    return sorted(key for key, row in rows.items() if has_some(row))
 
 
 def _bounds(keys: list[ChunkKey], resolution: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -245,8 +220,7 @@ def _write_cloud(
     with appearing_file(path, replace=replace) as file:
         file.write(bytes(room))
         for key in keys:
-            _, view = stored.chunk(key)
-            points = _points(key, view, stored.settings.resolution, voxels, frame)
+            points = _points(key, stored.chunk(key), stored.settings.resolution, voxels, frame)
             file.write(points.view(np.uint8).data)
             count += len(points)
             chunks += len(points) > 0

@@ -8,55 +8,30 @@ may leave the old content or name, or any part of the new content.
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import errno
 import fcntl
 import os
 import secrets
 import stat
+from collections.abc import Iterator
 from itertools import count
 from typing import Final
 
 from shmmap.errors import InstanceBusy
 
-__all__ = [
-    "DAMAGED",
-    "INTERIM",
-    "Folder",
-    "FolderToRead",
-    "quarantine",
-    "replace_file",
-    "write_beside",
-]
-
 INTERIM: Final = ".tmp"
 """Suffix of a file that does not have its final name yet; its interim name begins with a dot."""
 DAMAGED: Final = ".damaged."
-"""Infix between a quarantined file's original name and a number."""
+"""Infix between the original name of a damaged file that was put aside and a number."""
 MAX_BYTES: Final = 1 << 28
 """Most bytes that are read from a file: more than an undamaged file can have."""
 
 
-_libc: Final = ctypes.CDLL(None, use_errno=True)
-_RENAME_EXCHANGE: Final = 2
-
-
-def write_beside(folder: Folder, name: str, data: bytes) -> str:
-    """Write a file for this name under an interim name; return the interim name."""
+def replace_file(folder: Folder, name: str, data: bytes) -> None:
+    """Write a file to disk, replacing any file of its name; `sync_names` makes the name durable."""
     interim = f".{name}.{secrets.token_hex(4)}{INTERIM}"
     try:
         folder.write(interim, data)
-    except OSError:
-        with contextlib.suppress(OSError):
-            folder.remove(interim)
-        raise
-    return interim
-
-
-def replace_file(folder: Folder, name: str, data: bytes) -> None:
-    """Write a file to disk, replacing any file of its name; `sync_names` makes the name durable."""
-    interim = write_beside(folder, name, data)
-    try:
         folder.sync(interim)
         folder.rename(interim, name)
     except OSError:
@@ -65,13 +40,19 @@ def replace_file(folder: Folder, name: str, data: bytes) -> None:
         raise
 
 
-def quarantine(folder: Folder, name: str) -> str:
-    """Rename a damaged file to a quarantine name, durably; return that name."""
+def free_name(folder: FolderToRead, start: str) -> str:
+    """Return a name that is not taken: ``start`` and a number."""
     taken = set(folder.names())
-    other = next(one for number in count(1) if (one := f"{name}{DAMAGED}{number}") not in taken)
-    folder.rename(name, other)
-    folder.sync_names()
-    return other
+    return next(one for number in count(1) if (one := f"{start}{number}") not in taken)
+
+
+@contextlib.contextmanager
+def named(name: str) -> Iterator[None]:
+    """Add a file's name to errors of the operating system."""
+    try:
+        yield
+    except OSError as error:
+        raise OSError(error.errno, f"{name} cannot be read: {error.strerror}") from error
 
 
 _KINDS: Final = {
@@ -80,8 +61,15 @@ _KINDS: Final = {
     stat.S_IFSOCK: "a socket",
     stat.S_IFCHR: "a device",
     stat.S_IFBLK: "a device",
+    stat.S_IFLNK: "a symbolic link",
 }
 """Descriptions of files that are not regular, by type."""
+
+
+def _require_regular(mode: int, name: str) -> None:
+    if not stat.S_ISREG(mode):
+        kind = _KINDS.get(stat.S_IFMT(mode), "something else")
+        raise OSError(errno.EINVAL, f"it is {kind}, not a regular file", name)
 
 
 class FolderToRead:
@@ -105,6 +93,15 @@ class FolderToRead:
         """Return all names."""
         return os.listdir(self._fd)
 
+    def place(self, name: str) -> str:
+        """Return a path of a file in the directory, wherever that was moved since it was opened."""
+        return f"/proc/self/fd/{self._fd}/{name}"
+
+    def require_regular(self, name: str) -> None:
+        """Raise OSError if there is something of this name that is no regular file."""
+        with contextlib.suppress(FileNotFoundError):
+            _require_regular(os.stat(name, dir_fd=self._fd, follow_symlinks=False).st_mode, name)
+
     def size(self, name: str) -> int:
         """Return the length of a file, bytes."""
         return os.stat(name, dir_fd=self._fd, follow_symlinks=False).st_size
@@ -125,9 +122,7 @@ class FolderToRead:
             fd = self._open(name, os.O_RDONLY)
             try:
                 before = os.fstat(fd)
-                if not stat.S_ISREG(before.st_mode):
-                    kind = _KINDS.get(stat.S_IFMT(before.st_mode), "something else")
-                    raise OSError(errno.EINVAL, f"it is {kind}, not a regular file", name)
+                _require_regular(before.st_mode, name)
                 left = min(before.st_size, most)
                 parts = []
                 while left and (part := os.read(fd, left)):
@@ -173,20 +168,11 @@ class Folder(FolderToRead):
 
     def write(self, name: str, data: bytes) -> None:
         """Create a file."""
-        self._write(self._open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL), data)
-
-    def overwrite(self, name: str, data: bytes) -> None:
-        """Overwrite an unneeded file; after a failure it has a mixture of both contents."""
-        self._write(self._open(name, os.O_WRONLY), data)
-
-    def _write(self, fd: int, data: bytes) -> None:
+        fd = self._open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
         try:
-            before = os.fstat(fd).st_size
             left = memoryview(data)
             while left:
                 left = left[os.write(fd, left) :]
-            if before > len(data):
-                os.ftruncate(fd, len(data))
         finally:
             os.close(fd)
 
@@ -197,15 +183,6 @@ class Folder(FolderToRead):
             os.fdatasync(fd)
         finally:
             os.close(fd)
-
-    def exchange(self, one: str, other: str) -> None:
-        """Exchange the names of two files atomically; raise OSError if the file system cannot."""
-        swap = getattr(_libc, "renameat2", None)
-        if swap is None:
-            raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
-        if swap(self._fd, os.fsencode(one), self._fd, os.fsencode(other), _RENAME_EXCHANGE):
-            number = ctypes.get_errno()
-            raise OSError(number, os.strerror(number), one)
 
     def rename(self, old: str, new: str) -> None:
         """Rename a file, replacing any file that has the new name."""

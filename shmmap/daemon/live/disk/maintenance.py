@@ -1,56 +1,40 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Check the files of a live map, repair what can be repaired, and reset the whole map."""
+"""Check the database of a live map, repair what can be repaired, and reset the whole map."""
 
 from __future__ import annotations
 
+import contextlib
 import os
-from itertools import count
 from typing import Literal
 
 import msgspec
 
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.disk.folder import Folder, FolderToRead, quarantine
-from shmmap.daemon.live.disk.map_record import (
-    CHUNK,
-    MANIFEST,
-    MAP_FILE,
-    FileNames,
-    Listed,
-    Row,
-    read_header,
-    write_rows,
-)
-from shmmap.daemon.live.disk.stored_map import StoredMap
+from shmmap.daemon.live.disk.folder import Folder, FolderToRead, free_name
+from shmmap.daemon.live.disk.map_record import MAP_FILE, Lost, MapRecord, Row, read_map
+from shmmap.daemon.live.disk.old_directory import OldFiles
+from shmmap.daemon.live.disk.rebuilding import Salvage, rebuild, salvage
+from shmmap.daemon.live.disk.schema import DATABASE, LOG, SHARED, TABLES_DAMAGED, connect, database_errors
+from shmmap.daemon.live.disk.stored_map import StoredMap, asides
 from shmmap.errors import MapDataError
 from shmmap.formats.durable_file import flush_directory
 
-__all__ = [
-    "CheckedMap",
-    "DamagedFile",
-    "MissingChunk",
-    "ResetMap",
-    "check",
-    "files_of_map",
-    "repair",
-    "reset",
-]
 
+class LostChunk(msgspec.Struct, frozen=True):
+    """A chunk of which something is lost.
 
-class DamagedFile(msgspec.Struct):
-    """A damaged file; ``kept_as`` is its name in quarantine, empty if it is not quarantined."""
-
-    file: str
-    reason: str
-    kept_as: str = ""
-
-
-class MissingChunk(msgspec.Struct, frozen=True):
-    """A chunk whose saved ``version`` is lost; ``found`` is the version on disk now, 0 for none."""
+    Attributes
+    ----------
+    version
+        Version that was saved; 0 if unknown.
+    found
+        Version that is on disk now; 0 for none.
+    """
 
     chunk: str
     version: int
     found: int
+    reason: str
 
 
 class CheckedMap(msgspec.Struct):
@@ -62,22 +46,14 @@ class CheckedMap(msgspec.Struct):
         Edge of a voxel, metres.
     rows
         The good chunks.
-    unreadable
-        Files that this process may not read, or that are not regular, with the reason: they may be undamaged.
-        `repair` quarantines them, too.
-    missing
-        Chunks of which something is lost: the manifest lists a version for which there is no file, or that a
-        daemon lost, whatever was mapped there since.
-    manifest
-        ``stale`` if its list of chunks differs from the files, as after a daemon was killed.
-    interim
-        Files still under interim names: the daemon takes over the good ones at its next start.
-    quarantined
-        Files that were quarantined before.
-    strange
-        Files named like chunks, but with impossible keys.
-    rewritten
-        Whether a new manifest was written.
+    damaged
+        What is wrong with the database's tables; empty if nothing is.
+    lost
+        Chunks of which something that was saved is lost: damaged now, or found so before.
+    aside
+        Damaged databases that were put aside.
+    rebuilt_from
+        Name of the database that a repair put aside; empty without one.
     """
 
     path: str
@@ -85,19 +61,15 @@ class CheckedMap(msgspec.Struct):
     resolution: float
     frame_id: str
     rows: dict[ChunkKey, Row]
-    damaged: list[DamagedFile]
-    unreadable: dict[str, str]
-    missing: list[MissingChunk]
-    manifest: Literal["current", "stale", "absent", "unreadable"]
-    interim: list[str]
-    quarantined: list[str]
-    strange: list[str]
-    rewritten: bool = False
+    damaged: str
+    lost: list[LostChunk]
+    aside: list[str]
+    rebuilt_from: str = ""
 
     @property
     def good(self) -> bool:
         """Whether all that was saved is on disk, undamaged."""
-        return not (self.damaged or self.unreadable or self.missing or self.manifest == "unreadable")
+        return not (self.damaged or self.lost)
 
     def total(self, what: Literal["bytes", "active", "occupied", "free", "bricks"]) -> int:
         """Return the sum over the good chunks."""
@@ -105,106 +77,79 @@ class CheckedMap(msgspec.Struct):
 
 
 def check(files: FolderToRead, path: str) -> CheckedMap:
-    """Read every chunk completely, without changing anything; other processes may be using the files.
+    """Read every chunk completely, without changing anything; other processes may be using the database.
 
     Raises
     ------
     MapDataError
-        ``map.json`` is damaged or invalid.
+        The record is damaged, and so is its copy; or the database cannot be read.
     PackageMissing
         A chunk is compressed by a package that is not installed.
     """
-    stored = StoredMap(files, path)
-    listed = stored.listed
-    rows: dict[ChunkKey, Row] = {}
-    damaged: list[DamagedFile] = []
-    unreadable: dict[str, str] = {}
-    for key, name in stored.chunks.items():
-        row = _row_or_error(stored, key)
-        if isinstance(row, Row):
-            rows[key] = row
-            continue
-        reason = row.message.removeprefix(f"{row.path}: ")
-        if row.cause == "unreadable":
-            unreadable[name] = reason
-        elif row.cause != "missing":  # removed since the names were listed
-            damaged.append(DamagedFile(name, reason))
-    known = {one.file for one in damaged} | unreadable.keys()
-    interim = []
-    for name in stored.names.interim:
-        try:
-            if not _is_spare(files, name, rows):
-                interim.append(name)
-        except OSError as error:  # noqa: PERF203  the next file may be readable
-            unreadable[name] = f"it cannot be read: {error.strerror}"
+    try:
+        with StoredMap(files, path) as stored:
+            rows, lost = dict(stored.rows), dict(stored.lost)
+            for key, row in stored.rows.items():
+                try:
+                    stored.chunk(key)
+                except MapDataError as error:  # noqa: PERF203  the next one may be good
+                    if error.cause == "unreadable":
+                        raise
+                    del rows[key]
+                    lost[key] = Lost(row.version, error.message.removeprefix(f"{error.path}: "))
+            map_id, settings, damaged = stored.map_id.hex(), stored.settings, ""
+    except MapDataError as error:
+        if error.cause != TABLES_DAMAGED:
+            raise
+        damaged = error.message.removeprefix(f"{path}: ")
+        found, record = _salvaged(files, error)
+        rows = {key: row for key, (row, _) in found.rows.items()}
+        lost = record.lost_chunks
+        for key, version in found.names.items():
+            if key not in rows or rows[key].version < version:
+                lost[key] = Lost(version, damaged)
+        map_id, settings = record.map_id, record.settings
     return CheckedMap(
-        path=path,
-        map_id=stored.map_id.hex(),
-        resolution=stored.settings.resolution,
-        frame_id=stored.settings.frame_id,
-        rows=rows,
-        damaged=damaged,
-        unreadable=unreadable,
-        missing=_missing(listed.lost(rows), rows, known) if listed is not None else [],
-        manifest=(
-            ("current" if listed.chunks == rows else "stale")
-            if listed is not None
-            else "unreadable"
-            if stored.manifest_error
-            else "absent"
-        ),
-        interim=interim,
-        quarantined=stored.names.quarantined,
-        strange=stored.names.strange,
+        path,
+        map_id,
+        settings.resolution,
+        settings.frame_id,
+        rows,
+        damaged,
+        [
+            LostChunk(key.text, one.version, rows[key].version if key in rows else 0, one.reason)
+            for key, one in sorted(lost.items())
+        ],
+        asides(files),
     )
 
 
-def _is_spare(files: FolderToRead, name: str, rows: dict[ChunkKey, Row]) -> bool:
-    """Return whether a file is only a spare: its chunk's own file is as new.  Raise OSError."""
-    try:
-        header = read_header(files, name)
-    except (FileNotFoundError, MapDataError):
-        return False
-    return header.key in rows and rows[header.key].version >= header.version
-
-
-def _row_or_error(stored: StoredMap, key: ChunkKey) -> Row | MapDataError:
-    try:
-        header, _ = stored.chunk(key)
-    except MapDataError as error:
-        return error
-    return Row.of(header)
-
-
-def _missing(lost: dict[ChunkKey, Row], rows: dict[ChunkKey, Row], known: set[str]) -> list[MissingChunk]:
-    return [
-        MissingChunk(key.text, row.version, rows[key].version if key in rows else 0)
-        for key, row in lost.items()
-        if key.text + CHUNK not in known
-    ]
+def _salvaged(files: FolderToRead, why: MapDataError) -> tuple[Salvage, MapRecord]:
+    """Return what is left of a database, and the map's record: of that, or its copy."""
+    found = salvage(files, None)
+    record = found.record
+    with contextlib.suppress(OSError, MapDataError):
+        record = record or read_map(files)
+    if record is None:
+        raise why
+    return found, record
 
 
 def repair(files: Folder, found: CheckedMap) -> None:
-    """Quarantine files that are damaged or cannot be read, and list the good ones in a new manifest.
+    """Make a database of the good chunks, which names none that is lost; put the old one aside.
 
-    ``found`` is updated: all quarantined files are then in ``damaged``, with their new names.  No other
-    process may have changed the files since the check.  Nothing is deleted.
+    ``found`` is updated.  Nothing is deleted.
 
     Raises
     ------
     OSError
-        A file cannot be renamed or written.
+        The disk is full, or fails.
     """
-    found.damaged += [DamagedFile(name, reason) for name, reason in found.unreadable.items()]
-    found.unreadable = {}
-    if found.manifest == "unreadable":
-        found.damaged.append(DamagedFile(MANIFEST, "it cannot be read, or does not list chunks"))
-    for one in found.damaged:
-        one.kept_as = quarantine(files, one.file)
-    if found.manifest != "current" or found.missing:
-        # a program that replays its scans restores the damaged chunks
-        write_rows(files, Listed(found.rows, {}, {}))
-        found.rewritten = True
+    if found.good:
+        return
+    _, record = _salvaged(files, MapDataError("the record is damaged", path=found.path))
+    record.lost = {}
+    _, found.rebuilt_from = rebuild(files, record, {}, found.damaged or "chunks are lost")
 
 
 class ResetMap(msgspec.Struct, frozen=True):
@@ -217,8 +162,16 @@ class ResetMap(msgspec.Struct, frozen=True):
 
 
 def files_of_map(files: FolderToRead) -> dict[str, int]:
-    """Return the sizes of the map's own files, in the order in which they may be removed."""
-    return {name: files.size(name) for name in FileNames.of(files.names()).of_map}
+    """Return the sizes of the map's own files, in the order in which they may be removed.
+
+    If the process is killed in between, a valid live map remains: the database goes last, or ``map.json``,
+    without which the files of an earlier version are meaningless.
+    """
+    names = files.names()
+    own = (DATABASE + ".", f".{MAP_FILE}.", LOG, SHARED)
+    others = sorted(name for name in names if name.startswith(own))
+    last = [name for name in (MAP_FILE, DATABASE) if name in names]
+    return {name: files.size(name) for name in [*OldFiles.of(names).all, *others, *last]}
 
 
 def reset(folder: Folder, *, delete: bool) -> ResetMap:
@@ -236,11 +189,17 @@ def reset(folder: Folder, *, delete: bool) -> ResetMap:
     OSError
         A file cannot be moved or deleted.
     """
+    if DATABASE in folder.names():
+        with (
+            contextlib.suppress(OSError, MapDataError),
+            database_errors(folder),
+            contextlib.closing(connect(folder)) as database,
+        ):
+            database.execute("pragma wal_checkpoint(truncate)").fetchall()  # without its log it is older
     sizes = files_of_map(folder)
     aside = ""
     if not delete:
-        taken = set(folder.names())
-        name = next(one for number in count(1) if (one := f"reset.{number}") not in taken)
+        name = free_name(folder, "reset.")
         aside = os.path.join(folder.path, name)
         os.mkdir(aside, mode=0o700)
     for name in sizes:
@@ -248,8 +207,7 @@ def reset(folder: Folder, *, delete: bool) -> ResetMap:
             folder.remove(name)
         else:
             folder.rename(name, os.path.join(os.path.basename(aside), name))
-        if name in {MANIFEST, MAP_FILE}:
-            _sync(folder, aside)
+        _sync(folder, aside)
     _sync(folder, aside)
     return ResetMap(folder.path, aside, len(sizes), sum(sizes.values()))
 

@@ -1,59 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The files in the directory of a live map: their names, ``map.json``, ``manifest.json``, headers of chunks.
+"""The record of a live map: its settings, its mappers, and the chunks that are lost.
 
-All reads of the directory use this module; ``map_files.py`` explains the files' purpose.  Reading is bounded
-whatever a file contains, and invalid content raises `MapDataError`.
+It is a row of the database; ``map.json`` is a copy, in case the database is damaged.  Invalid content raises
+`MapDataError`.
 """
 
 from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Iterable, Mapping
-from typing import Annotated, Final, NamedTuple, TypeAlias, TypeVar
+from typing import Annotated, Final, TypeAlias, TypeVar
 
 import msgspec
 
-from shmmap.chunks.chunk_file import FILE_HEADER_BYTES, ChunkFileHeader, read_file_header
+from shmmap.chunks.chunk_file import FILE_HEADER_BYTES, ChunkFileHeader
 from shmmap.chunks.layout import MAPPERS, MAX_FRAME_BYTES, ChunkIdentity
-from shmmap.chunks.layout import MAX_BYTES as MAX_CHUNK_BYTES
 from shmmap.chunks.occupancy import Occupancy
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.disk.folder import DAMAGED, INTERIM, MAX_BYTES, Folder, FolderToRead, replace_file
+from shmmap.daemon.live.disk.folder import FolderToRead
 from shmmap.errors import BadRequest, ConfigError, MapDataError
-
-__all__ = [
-    "CHUNK",
-    "MANIFEST",
-    "MAP_FILE",
-    "MAP_FORMAT",
-    "FileNames",
-    "Listed",
-    "Manifest",
-    "MapRecord",
-    "MapSettings",
-    "Mapper",
-    "Row",
-    "read_chunk",
-    "read_header",
-    "read_manifest",
-    "read_map",
-    "write_rows",
-]
 
 _T = TypeVar("_T")
 
 MAP_FILE: Final = "map.json"
-MANIFEST: Final = "manifest.json"
-MAP_FORMAT: Final = 1
-CHUNK: Final = ".chunk"
-"""Suffix of the files of chunks."""
-
-_MAX_CHUNK_FILE_BYTES: Final = 2 * MAX_CHUNK_BYTES
-"""Maximum length of a chunk's file: incompressible content becomes slightly longer."""
-_MAX_MAP_BYTES: Final = 1 << 20
-_MAX_MANIFEST_BYTES: Final = MAX_BYTES - 1
-"""Maximum length of ``map.json`` and of ``manifest.json``: about two million chunks."""
+MAP_FORMAT: Final = 2
+OLD_FORMAT: Final = 1
+"""Of a directory in which each chunk is a file: until 0.3."""
+_MAX_MAP_BYTES: Final = 1 << 26
 _MAP_ID: Final = re.compile(r"[0-9a-f]{32}")
 _RESOLUTION_M: Final = (1e-4, 1e3)
 _NOT_DECODED: Final = (
@@ -114,7 +87,7 @@ class Mapper(msgspec.Struct):
 
 
 class Row(msgspec.Struct, frozen=True):
-    """Data about a chunk's file that is known without opening it."""
+    """Data about a saved chunk that is known without reading it."""
 
     version: Count
     bytes: Count
@@ -130,8 +103,41 @@ class Row(msgspec.Struct, frozen=True):
         return cls(header.version, size, header.active, header.occupied, header.free, header.bricks)
 
 
+class Lost(msgspec.Struct, frozen=True):
+    """A chunk of which something that was saved is lost.
+
+    Attributes
+    ----------
+    version
+        Version that was saved; 0 if unknown.
+    reason
+        What was found.
+    remade
+        Whether memory may have the chunk again, without what is lost.
+    """
+
+    version: Count
+    reason: str
+    remade: bool = False
+
+    @property
+    def text(self) -> str:
+        """What is lost."""
+        return f"version {self.version} is missing" if self.version else "what was saved is missing"
+
+
 class MapRecord(msgspec.Struct):
-    """Content of ``map.json``."""
+    """Everything about a map but its chunks.
+
+    Attributes
+    ----------
+    applied
+        For each mapper's number, the last scan up to which at least all are durable.
+    lost
+        Chunks that lost something, by key, until that is forgotten on purpose.
+    damaged
+        Numbers of damaged rows, which stay as they are and do not count.
+    """
 
     format: int
     map_id: str
@@ -139,105 +145,22 @@ class MapRecord(msgspec.Struct):
     mappers: list[Mapper] = []
     next_mapper: Annotated[int, msgspec.Meta(ge=1, le=1 << 53)] = 1
     runs: Annotated[int, msgspec.Meta(ge=0, lt=(1 << 31) - 1)] = msgspec.field(default=0, name="lives")
-
-
-class Manifest(msgspec.Struct):
-    """Content of ``manifest.json``.
-
-    Attributes
-    ----------
-    chunks
-        The durable chunks.
-    applied
-        For each mapper's number, the last scan up to which at least all are durable.
-    missing
-        Chunks of which something was lost, as they were listed: a file was quarantined, or is gone.
-    """
-
-    format: int
-    chunks: dict[str, Row]
     applied: dict[int, Count] = {}
-    missing: dict[str, Row] = {}
-
-
-class FileNames(NamedTuple):
-    """The files in the directory of a live map, by kind.
-
-    Attributes
-    ----------
-    chunks
-        By key, in the order of the keys.
-    strange
-        Files named like chunks, but with impossible keys.
-    interim
-        Files still under interim names.
-    quarantined
-        Damaged or unreadable files that were given other names.
-    """
-
-    everything: list[str]
-    chunks: dict[ChunkKey, str]
-    strange: list[str]
-    interim: list[str]
-    quarantined: list[str]
-
-    @classmethod
-    def of(cls, names: Iterable[str]) -> FileNames:
-        """Sort names by kind of file."""
-        found = cls(sorted(names), {}, [], [], [])
-        chunks: dict[ChunkKey, str] = {}
-        for name in found.everything:
-            if name.startswith(".") and name.endswith(INTERIM):
-                found.interim.append(name)
-            elif DAMAGED in name and name.rpartition(".")[2].isdecimal():
-                found.quarantined.append(name)
-            elif name.endswith(CHUNK):
-                try:
-                    chunks[ChunkKey.from_text(name.removesuffix(CHUNK))] = name
-                except BadRequest:
-                    found.strange.append(name)
-        found.chunks.update(sorted(chunks.items()))
-        return found
+    lost: dict[str, Lost] = {}
+    damaged: list[Count] = []
 
     @property
-    def of_map(self) -> list[str]:
-        """The map's own files, in the order in which they may be removed or moved.
-
-        If the process is killed in between, a valid live map remains.  So the manifest, which would report
-        chunks as missing, is removed first, and ``map.json``, without which chunks are meaningless, last.
-        """
-        own = (f".{MAP_FILE}.", f".{MANIFEST}.")
-        interim = [name for name in self.interim if name.startswith(own) or f"{CHUNK}." in name]
-        others = [*self.chunks.values(), *self.strange, *self.quarantined, *interim]
-        there = set(self.everything)
-        first, last = [MANIFEST] if MANIFEST in there else [], [MAP_FILE] if MAP_FILE in there else []
-        return [*first, *sorted(others), *last]
-
-
-def _whole(files: FolderToRead, name: str, most: int) -> bytes:
-    """Return a whole file of at most ``most`` bytes; raise as `read_map`."""
-    data = files.read(name, most + 1)
-    if len(data) > most:
-        raise MapDataError(f"it has more than {most:,} bytes", path=name, cause="too_long")
-    return data
-
-
-def read_chunk(files: FolderToRead, name: str) -> bytes:
-    """Return the whole file of a chunk, unchecked; raise as `read_map`."""
-    return _whole(files, name, _MAX_CHUNK_FILE_BYTES)
-
-
-def read_header(files: FolderToRead, name: str, path: str = "") -> ChunkFileHeader:
-    """Return the header of a chunk's file, which errors call ``path``; raise as `read_map`."""
-    return read_file_header(files.read(name, FILE_HEADER_BYTES), path or name)
+    def lost_chunks(self) -> dict[ChunkKey, Lost]:
+        """The lost chunks by their keys."""
+        return {ChunkKey.from_text(text): one for text, one in self.lost.items()}
 
 
 # created once, here: msgspec crashes if several threads decode a type for the first time concurrently
 _map_record: Final = msgspec.json.Decoder(MapRecord)
-_manifest: Final = msgspec.json.Decoder(Manifest)
 
 
-def _decoded(data: bytes, decoder: msgspec.json.Decoder[_T], name: str) -> _T:
+def decoded(data: bytes | str, decoder: msgspec.json.Decoder[_T], name: str) -> _T:
+    """Decode JSON that may be damaged; raise `MapDataError`."""
     try:
         return decoder.decode(data)
     except _NOT_DECODED as error:
@@ -246,7 +169,7 @@ def _decoded(data: bytes, decoder: msgspec.json.Decoder[_T], name: str) -> _T:
 
 
 def read_map(files: FolderToRead) -> MapRecord:
-    """Read ``map.json``.
+    """Read ``map.json``, which may be that of a directory without a database.
 
     Raises
     ------
@@ -255,9 +178,14 @@ def read_map(files: FolderToRead) -> MapRecord:
     OSError
         It cannot be read.
     """
-    found = _decoded(_whole(files, MAP_FILE, _MAX_MAP_BYTES), _map_record, MAP_FILE)
-    if found.format != MAP_FORMAT:
-        raise MapDataError(f"format {found.format}; this reads {MAP_FORMAT}", path=MAP_FILE)
+    return decode_map(whole_file(files, MAP_FILE, _MAX_MAP_BYTES), MAP_FILE, formats=(OLD_FORMAT, MAP_FORMAT))
+
+
+def decode_map(data: bytes | str, path: str, *, formats: tuple[int, ...] = (MAP_FORMAT,)) -> MapRecord:
+    """Return a record that is as it was written; else raise `MapDataError`."""
+    found = decoded(data, _map_record, path)
+    if found.format not in formats:
+        raise MapDataError(f"format {found.format}; this reads {MAP_FORMAT}", path=path)
     numbers = [one.number for one in found.mappers]
     least, most = _RESOLUTION_M
     for is_right, what in (
@@ -266,55 +194,25 @@ def read_map(files: FolderToRead) -> MapRecord:
         (0 < len(found.settings.frame_id.encode()) <= MAX_FRAME_BYTES, "frame_id is empty or too long"),
         (len(numbers) <= MAPPERS, f"{len(numbers)} mappers; {MAPPERS} are the most"),
         (len(set(numbers)) == len(numbers), "two mappers have one number"),
+        (all(map(_is_key, found.lost)), "a lost chunk has no key"),
         (max(numbers, default=0) < found.next_mapper, "a mapper has a number that was not given yet"),
     ):
         if not is_right:
-            raise MapDataError(f"it is damaged: {what}", path=MAP_FILE)
+            raise MapDataError(f"it is damaged: {what}", path=path)
     return found
 
 
-class Listed(NamedTuple):
-    """What the manifest lists; attributes as in `Manifest`."""
-
-    chunks: dict[ChunkKey, Row]
-    applied: dict[int, int]
-    missing: dict[ChunkKey, Row]
-
-    def lost(self, rows: Mapping[ChunkKey, Row]) -> dict[ChunkKey, Row]:
-        """Return, of what was listed, the chunks of which these rows of good files lack something."""
-        found = {
-            key: row for key, row in self.chunks.items() if key not in rows or rows[key].version < row.version
-        }
-        return {**found, **{key: row for key, row in self.missing.items() if rows.get(key) != row}}
-
-
-def read_manifest(files: FolderToRead) -> Listed:
-    """Read ``manifest.json``.
-
-    Raises
-    ------
-    MapDataError
-        The file is damaged or invalid.
-    OSError
-        The file cannot be read; FileNotFoundError if there is none.
-    """
-    found = _decoded(_whole(files, MANIFEST, _MAX_MANIFEST_BYTES), _manifest, MANIFEST)
-    if found.format != MAP_FORMAT:
-        raise MapDataError(f"format {found.format}; this reads {MAP_FORMAT}", path=MANIFEST)
+def _is_key(text: str) -> bool:
     try:
-        chunks, missing = (
-            {ChunkKey.from_text(text): row for text, row in rows.items()}
-            for rows in (found.chunks, found.missing)
-        )
-    except BadRequest as error:
-        raise MapDataError(f"it is damaged: {error.message}", path=MANIFEST) from error
-    return Listed(chunks, found.applied, missing)
+        ChunkKey.from_text(text)
+    except BadRequest:
+        return False
+    return True
 
 
-def write_rows(files: Folder, listed: Listed) -> None:
-    """Write the manifest."""
-    chunks, missing = (
-        {key.text: row for key, row in rows.items()} for rows in (listed.chunks, listed.missing)
-    )
-    replace_file(files, MANIFEST, msgspec.json.encode(Manifest(MAP_FORMAT, chunks, listed.applied, missing)))
-    files.sync_names()
+def whole_file(files: FolderToRead, name: str, most: int) -> bytes:
+    """Return a whole file of at most ``most`` bytes; raise as `read_map`."""
+    data = files.read(name, most + 1)
+    if len(data) > most:
+        raise MapDataError(f"it has more than {most:,} bytes", path=name, cause="too_long")
+    return data

@@ -1,124 +1,146 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read a live map from its files, without changing anything.
+"""Read a live map from its database, without changing anything.
 
-A daemon may be using the map meanwhile: each file is replaced as a whole.
+A daemon may be using the map meanwhile: each chunk is read in a transaction of its own, and only that long
+has the daemon to keep its log.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
+import sqlite3
 from collections.abc import Iterator
+from types import TracebackType
 
-from shmmap.chunks.chunk_file import ChunkFileHeader, check_identity, decode_chunk, read_file_header
+from shmmap.chunks.chunk_file import decode_chunk
 from shmmap.chunks.layout import ChunkView
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.disk.folder import Folder, FolderToRead
-from shmmap.daemon.live.disk.map_record import (
-    CHUNK,
-    MAP_FILE,
-    FileNames,
-    Listed,
-    read_chunk,
-    read_header,
-    read_manifest,
-    read_map,
+from shmmap.daemon.live.disk.folder import DAMAGED, Folder, FolderToRead
+from shmmap.daemon.live.disk.map_record import MAP_FILE
+from shmmap.daemon.live.disk.old_directory import OldFiles
+from shmmap.daemon.live.disk.schema import (
+    DATABASE,
+    GET_DATA,
+    LOG,
+    check_tables,
+    connect,
+    database_errors,
+    read_record,
+    read_rows,
+    require_own_files,
+    valid_rows,
 )
 from shmmap.errors import InstanceBusy, MapDataError, MapMissing
 
-__all__ = ["StoredMap", "opened_folder", "opened_folder_to_read"]
-
 
 class StoredMap:
-    """A live map's settings, and its chunks one by one.
+    """A live map's settings, and its chunks one by one.  A context manager, which closes the database.
 
     Parameters
     ----------
+    files
+        The map's directory.
     path
         Path of the directory in error messages.
 
     Attributes
     ----------
     map_id, settings
-        As in ``map.json``.
-    listed
-        What the manifest lists; None without one, or if it is damaged (`manifest_error`).
-    names, chunks
-        All files of the directory, and among them those of chunks, by key.
+        As in the map's record.
+    rows, lost
+        As in `MapFiles`.
+    aside
+        Damaged databases that were put aside before.
 
     Raises
     ------
     MapDataError
-        ``map.json`` is damaged or invalid.
+        The tables are damaged (cause `TABLES_DAMAGED`), or the database cannot be read.
     """
 
     def __init__(self, files: FolderToRead, path: str) -> None:
         self.files = files
         self.path = path
-        try:
-            try:
-                record = read_map(files)
-            except OSError as error:
-                raise MapDataError(f"it cannot be read: {error.strerror}", path=MAP_FILE) from error
-        except MapDataError as error:
-            raise MapDataError(
-                error.message,
-                path=path,
-                hint="bring the file back from a copy; or have `shmmap live reset` put the whole map aside",
-            ) from error
-        self.map_id = bytes.fromhex(record.map_id)
-        self.settings = record.settings
-        self.listed: Listed | None = None
-        self.manifest_error = ""
-        try:  # before the files, since files only get newer
-            self.listed = read_manifest(files)
-        except FileNotFoundError:
-            pass
-        except (OSError, MapDataError) as error:
-            self.manifest_error = (error.strerror or "") if isinstance(error, OSError) else error.message
-        self.names = FileNames.of(files.names())
-        self.chunks = self.names.chunks
+        self.aside = asides(files)
+        self._open()
 
-    def header(self, key: ChunkKey) -> ChunkFileHeader:
-        """Return the header of a chunk's file; raise as `chunk`."""
-        path = self.path_of(key)
-        with _reading(path):
-            header = read_header(self.files, self.chunks[key], path)
-            check_identity(header, self.settings.identity(self.map_id, key, 0), path)
-            return header
+    def _open(self) -> None:
+        # without a log there is no daemon, and reading must not make one
+        self._is_alone = LOG not in self.files.names()
+        with self._reading(self.path):
+            require_own_files(self.files)
+            mode = "ro&immutable=1" if self._is_alone else "ro"
+            self._database: sqlite3.Connection = connect(self.files, mode=mode)
+            check_tables(self._database)
+            record = read_record(self._database)
+            self.map_id, self.settings = bytes.fromhex(record.map_id), record.settings
+            self.lost = record.lost_chunks
+            self.rows, self._numbers, _ = read_rows(self._database, record)
 
-    def chunk(self, key: ChunkKey) -> tuple[ChunkFileHeader, ChunkView]:
+    def chunk(self, key: ChunkKey) -> ChunkView:
         """Read a whole chunk and verify that it is as saved.
 
         Raises
         ------
         MapDataError
-            The file is damaged, unreadable (cause ``unreadable``), or was removed meanwhile (cause
-            ``missing``).
+            It is damaged, or cannot be read (cause ``unreadable``).
         PackageMissing
             The package for its codec is not installed.
         """
-        path = self.path_of(key)
-        with _reading(path):
-            data = read_chunk(self.files, self.chunks[key])
-            view = ChunkView(decode_chunk(data, self.settings.identity(self.map_id, key, 0), path))
-            return read_file_header(data), view
+        try:
+            return self._chunk(key)
+        except MapDataError:
+            if not self._is_alone or LOG not in self.files.names():
+                raise
+        self.close()
+        self._open()  # a daemon has begun meanwhile
+        return self._chunk(key)
 
-    def path_of(self, key: ChunkKey) -> str:
-        """Return the path of a chunk's file."""
-        return os.path.join(self.path, self.chunks[key])
+    def _chunk(self, key: ChunkKey) -> ChunkView:
+        path = f"{self.path}: chunk {key.text}"
+        with self._reading(path), valid_rows():
+            ((data,),) = self._database.execute(GET_DATA, (self._numbers[key],)).fetchall()
+            return ChunkView(decode_chunk(data, self.settings.identity(self.map_id, key, 0), path))
+
+    @contextlib.contextmanager
+    def _reading(self, path: str) -> Iterator[None]:
+        """Name the path in errors, and say what to do."""
+        try:
+            with database_errors(self.files):
+                yield
+        except OSError as error:
+            raise MapDataError(
+                f"it cannot be read: {error.strerror}",
+                path=path,
+                cause="unreadable",
+                hint="the user whom the daemon runs as may, and root",
+            ) from error
+        except MapDataError as error:
+            raise MapDataError(
+                error.message.removeprefix(f"{error.path}: "),
+                path=path,
+                cause=error.cause,
+                hint="`shmmap live fsck` finds what is damaged; --repair makes a database of what is good",
+            ) from error
+
+    def close(self) -> None:
+        """Close the database."""
+        self._database.close()
+
+    def __enter__(self) -> StoredMap:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
 
 
-@contextlib.contextmanager
-def _reading(path: str) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        cause = "missing" if isinstance(error, FileNotFoundError) else "unreadable"
-        raise MapDataError(f"it cannot be read: {error.strerror}", path=path, cause=cause) from error
-    except MapDataError as error:
-        error.hint = "`shmmap live fsck` finds all that is damaged, and quarantines it with --repair"
-        raise
+def asides(files: FolderToRead) -> list[str]:
+    """Return the names of damaged databases that were put aside."""
+    start = DATABASE + DAMAGED
+    return sorted(name for name in files.names() if name.startswith(start) and name[len(start) :].isdecimal())
 
 
 @contextlib.contextmanager
@@ -130,22 +152,28 @@ def opened_folder_to_read(path: str) -> Iterator[FolderToRead]:
     MapMissing
         There is no live map, or it cannot be opened.
     MapDataError
-        There are chunks, but no ``map.json`` that describes them.
+        It is one of an earlier version, or its database is missing.
     """
     with contextlib.closing(_opened(path)) as folder:
+        require_database(folder)
         yield folder
 
 
 @contextlib.contextmanager
 def opened_folder(path: str, hint: str) -> Iterator[Folder]:
-    """Open the directory of a live map for this process alone; ``hint`` is the remedy if it is in use.
+    """Open the directory of a live map, of any version, for this process alone.
+
+    Parameters
+    ----------
+    hint
+        The remedy if it is in use.
 
     Raises
     ------
     InstanceBusy
         Another process works with it.
-    MapMissing, MapDataError
-        As `opened_folder_to_read`.
+    MapMissing
+        There is no live map, or it cannot be opened.
     """
     _opened(path).close()  # checked first: locking would create a missing directory
     try:
@@ -154,6 +182,24 @@ def opened_folder(path: str, hint: str) -> Iterator[Folder]:
         raise InstanceBusy(error.message, hint=hint) from None
     with contextlib.closing(folder):
         yield folder
+
+
+def require_database(folder: FolderToRead) -> None:
+    """Raise `MapDataError` for a live map without a database: of an earlier version, or a damaged one."""
+    names = folder.names()
+    if DATABASE in names:
+        return
+    if OldFiles.of(names).all:
+        raise MapDataError(
+            "it is a live map of an earlier version, with a file for each chunk",
+            path=folder.path,
+            hint="a daemon imports it when it starts: `shmmap serve --live NAME=DIR`",
+        )
+    raise MapDataError(
+        f"{MAP_FILE} is there, but the database with the chunks is missing",
+        path=os.path.join(folder.path, DATABASE),
+        hint="bring the file back from a copy",
+    )
 
 
 def _opened(path: str) -> FolderToRead:
@@ -166,13 +212,7 @@ def _opened(path: str) -> FolderToRead:
             f"cannot open {path}: {error.strerror}", hint="the user whom the daemon runs as may, and root"
         ) from error
     names = folder.names()
-    if MAP_FILE in names:
+    if DATABASE in names or MAP_FILE in names or OldFiles.of(names).chunks:
         return folder
     folder.close()
-    if any(name.endswith(CHUNK) for name in names):
-        raise MapDataError(
-            f"there are chunks, but no {MAP_FILE} that says what they are",
-            path=path,
-            hint="bring the file back from a copy",
-        )
-    raise MapMissing(f"{path} is no live map: it has no {MAP_FILE}", hint="name the directory of a live map")
+    raise MapMissing(f"{path} is no live map: it has no {DATABASE}", hint="name the directory of a live map")

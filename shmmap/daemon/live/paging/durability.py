@@ -15,8 +15,6 @@ from typing import Final
 
 from shmmap.chunks.voxels import ChunkKey
 
-__all__ = ["Chunk", "Durability", "Scan", "State"]
-
 TOGETHER_S: Final = 1.0
 """Files written within this time are flushed together, each once, however often it was written."""
 

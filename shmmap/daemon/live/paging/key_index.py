@@ -9,8 +9,6 @@ from typing import Final, TypeAlias
 
 from shmmap.chunks.voxels import ChunkKey
 
-__all__ = ["EVERYWHERE", "KeyIndex", "KeyRange", "merged_part"]
-
 KeyRange: TypeAlias = tuple[ChunkKey, ChunkKey]
 """The least and the greatest key along each axis, both included."""
 

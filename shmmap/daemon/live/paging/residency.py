@@ -29,8 +29,6 @@ from shmmap.daemon.live.paging.durability import TOGETHER_S, Chunk, Durability, 
 from shmmap.daemon.live.paging.key_index import KeyIndex
 from shmmap.daemon.live.paging.windows import Windows
 
-__all__ = ["REVIEW_S", "Limits", "Residency"]
-
 RETRY_S: Final = 1.0
 """Delay before an unreadable or unwritable file, or a chunk evicted for a scan, is tried again."""
 REVIEW_S: Final = 0.1

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from shmmap.chunks.voxels import ChunkKey
 
-__all__ = ["Windows", "place_ahead"]
-
 Place: TypeAlias = tuple[float, float, float]
 
 

@@ -13,8 +13,6 @@ from shmmap.daemon.live.paging.key_index import EVERYWHERE, KeyRange
 from shmmap.errors import BadRequest
 from shmmap.protocol.areas import FURTHEST_M, LiveArea, SphereMessage
 
-__all__ = ["check_area", "inside", "key_range", "touches"]
-
 
 def check_area(area: LiveArea) -> None:
     """Raise `BadRequest` if an area is invalid."""

@@ -7,13 +7,10 @@ from collections.abc import Generator, Mapping
 from typing import Final
 
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.disk.map_files import loss_text
 from shmmap.daemon.live.paged_map import PagedMap
 from shmmap.daemon.live.worker.areas import touches
 from shmmap.protocol.areas import LiveArea
 from shmmap.protocol.live import MAX_LACKING, LackingChunk
-
-__all__ = ["lacking_chunks", "shown"]
 
 _KEYS_PER_STEP: Final = 64
 
@@ -21,9 +18,9 @@ _KEYS_PER_STEP: Final = 64
 def lacking_chunks(live: PagedMap, area: LiveArea | None) -> Generator[None, None, dict[ChunkKey, str]]:
     """Return the chunks that touch an area and have lost something, and what; yield after each step."""
     found: dict[ChunkKey, str] = {}
-    for number, (key, row) in enumerate(dict(live.files.missing).items(), 1):
+    for number, (key, one) in enumerate(dict(live.files.lost).items(), 1):
         if touches(area, key, live.resolution):
-            found[key] = loss_text(row)
+            found[key] = one.text
         if number % _KEYS_PER_STEP == 0:
             yield None
     return found

@@ -34,8 +34,6 @@ from shmmap.protocol.codec import decode_request, encode, request_number
 from shmmap.protocol.live import LIVE_REQUESTS, LiveList, LiveListed, LiveMapRow
 from shmmap.protocol.messages import ErrorReply
 
-__all__ = ["main"]
-
 STATUS_S: Final = 0.5
 MESSAGES_PER_TURN: Final = 16
 END_S: Final = 0.2
@@ -103,6 +101,7 @@ class _Worker:
         limits = _limits(settings, self._budget_bytes, len(wanted.maps))
         with contextlib.ExitStack() as closing:
             closing.callback(folder.close)
+            closing.callback(files.close, END_S)
             if self._marks is None:
                 self._marks = MarksDirectory(wanted.marks_dir, wanted.marks_gid)
             memory = ChunkMemory(wanted.shm_dir, prefix, wanted.gid)
@@ -120,7 +119,7 @@ class _Worker:
             chunks=adopted,
             files=len(files.rows),
             damaged=len(files.damaged),
-            missing=len(files.missing),
+            lost=len(files.lost),
         )
         return served
 

@@ -21,10 +21,8 @@ from shmmap.daemon.live.disk.map_files import MapFiles
 from shmmap.daemon.live.disk.map_record import Mapper
 from shmmap.errors import BadRequest, Busy, LiveInterrupted
 
-__all__ = ["APPLIED_BYTES", "ActiveMapper", "AppliedScans", "Mappers"]
-
 MAX_SCANS: Final = 1 << 61
-"""Bound of scan numbers: numbers that ``map.json`` reserves beyond them must be valid, too."""
+"""Bound of scan numbers: numbers that the map's record reserves beyond them must be valid, too."""
 _ROW: Final = np.dtype([("mapper", "<u8"), ("scan", "<u8")])
 APPLIED_BYTES: Final = _ROW.itemsize * MAPPERS
 

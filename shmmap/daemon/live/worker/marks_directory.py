@@ -3,6 +3,7 @@
 
 The directory belongs to the daemon; members of the mappers' group may create files in it and remove their own
 (mode 1770).  A file is named after the session that created it, and removed when that session has ended.
+The directory is ``shmmap-live.<instance>.marks``: ``shmmap.<instance>.`` begins the name of a segment.
 """
 
 from __future__ import annotations
@@ -15,8 +16,6 @@ from typing import Final
 
 from shmmap.errors import BadRequest
 from shmmap.private_directory import PRIVATE, open_private
-
-__all__ = ["MAX_MARKS_BYTES", "MarksDirectory"]
 
 MAX_MARKS_BYTES: Final = 32 << 20
 """Maximum length of one scan's marks; 120 000 points make 0.2 MB."""

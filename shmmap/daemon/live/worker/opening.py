@@ -6,6 +6,7 @@ A problem with one map's files is reported, and does not affect other maps.
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Callable
 from typing import Final
@@ -18,8 +19,6 @@ from shmmap.daemon.live.messages import not_served
 from shmmap.errors import ShmmapError
 from shmmap.logfmt import log
 from shmmap.protocol.live import LiveMapRow
-
-__all__ = ["OpeningMap"]
 
 LONG_S: Final = 1.0
 """Reading time that is reported as a problem; on a slow disk it ends by itself."""
@@ -109,13 +108,13 @@ class OpeningMap:
 
 def _open_files(settings: LiveSettings) -> tuple[Folder, MapFiles]:
     """Open a map's directory and read it; a new run of the map begins."""
-    folder = Folder(settings.path)
-    try:
+    with contextlib.ExitStack() as undo:
+        folder = Folder(settings.path)
+        undo.callback(folder.close)
         files = MapFiles(folder, MapSettings(settings.resolution, settings.occupancy, settings.frame_id))
+        undo.callback(files.close)
         files.begin_run()
-    except BaseException:
-        folder.close()
-        raise
+        undo.pop_all()
     return folder, files
 
 

@@ -32,8 +32,6 @@ from shmmap.protocol import live as messages
 from shmmap.protocol.areas import LiveArea
 from shmmap.protocol.messages import ErrorReply
 
-__all__ = ["Readers"]
-
 NOTHING: Final = Row(0, 0, 0, 0, 0, 0)
 """Row of a chunk without a file."""
 TURN_S: Final = 0.001

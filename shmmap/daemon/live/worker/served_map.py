@@ -32,8 +32,6 @@ from shmmap.logfmt import log
 from shmmap.protocol import live as messages
 from shmmap.protocol.messages import ErrorReply
 
-__all__ = ["ServedMap"]
-
 _T = TypeVar("_T")
 
 AHEAD_S: Final = 2.0
@@ -41,11 +39,11 @@ AHEAD_S: Final = 2.0
 MAX_AHEAD_CHUNKS: Final = 4.0
 MARKS_PART: Final = 2
 """Divisor of the budget for the marks of one scan, which are in shared memory until they are accepted."""
-MANIFEST_S: Final = 60.0
+RECORD_S: Final = 60.0
 SAY_WHY_S: Final = 1.0
 """After this time a scan that waits because of a problem is answered with the problem."""
 MAX_LOSSES: Final = 64
-"""Most damaged files and missing chunks that are named; all are counted."""
+"""Most lost chunks and damaged databases that are named; all are counted."""
 FILES_S: Final = 0.5
 """Interval at which the sizes of files are summed."""
 
@@ -115,8 +113,8 @@ class ServedMap:
         self._scans = self._durable = 0
         self._marks_bytes = 0  # size of marks in shared memory when last counted
         self._file_bytes, self._files_s = 0, -math.inf
-        self._manifest_s = 0.0
-        self._listed = -1
+        self._record_s = 0.0
+        self._recorded = -1
 
     def adopt(self, now_s: float) -> int:
         """Take over the chunks that a previous run left in memory; return how many; see `PagedMap.adopt`."""
@@ -362,11 +360,11 @@ class ServedMap:
         if self._saves:
             self._answer_saves()
         self.readers.run_turn(now_s)
-        due = now_s >= self._manifest_s and self.changes.number != self._listed
-        if due or self.live.files.manifest_is_due:
-            self.live.files.manifest_is_due = False
-            self._manifest_s, self._listed = now_s + MANIFEST_S, self.changes.number
-            self.live.list_files(self._durable_scans())
+        due = now_s >= self._record_s and self.changes.number != self._recorded
+        if due or self.live.files.record_is_due:
+            self.live.files.record_is_due = False
+            self._record_s, self._recorded = now_s + RECORD_S, self.changes.number
+            self.live.write_record(self._durable_scans())
 
     def next_turn_s(self, now_s: float) -> float:
         """Return the time at which the next turn is due, if nothing happens before."""

@@ -33,8 +33,6 @@ from shmmap.daemon.live.worker.lacking import lacking_chunks, shown
 from shmmap.errors import MapDataError, OverBudget
 from shmmap.protocol.live import LiveVoxels, LiveVoxelsReply
 
-__all__ = ["Later", "Steps", "VoxelLists"]
-
 LISTS_PER_SESSION: Final = 4
 VOXEL_BYTES: Final = 14
 PART_OF_BUDGET: Final = 4
@@ -148,7 +146,7 @@ class VoxelLists:
                         keep(part)
                     for key in lost:
                         self.live.note_lost(key, time.monotonic())
-                        lacking[key] = "its saved file is damaged, or gone"
+                        lacking[key] = "what was saved is damaged"
                 yield None
             lacking |= yield from lacking_chunks(self.live, message.area)
             yield from self._room(_pages(made))

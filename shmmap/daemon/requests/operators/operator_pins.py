@@ -25,8 +25,6 @@ from shmmap.protocol import messages
 from shmmap.protocol.messages import PinnedCell
 from shmmap.quantities import format_bytes
 
-__all__ = ["OperatorPins", "cells_named"]
-
 LOOKS_PER_BEAT: Final = 64
 """Pins checked per beat: about a fifth of a millisecond."""
 MAX_PINS: Final = 20_000

@@ -26,8 +26,6 @@ from shmmap.logfmt import log
 from shmmap.protocol import messages
 from shmmap.protocol.codec import encode
 
-__all__ = ["OPERATOR_REQUESTS", "Authorization", "OperatorRequests"]
-
 MEMORY_S: Final = 10.0
 """How long a user's groups are cached: looking them up may involve a remote server."""
 

@@ -12,52 +12,20 @@ from msgspec.structs import replace
 
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.cli.screens.map_scene import GLYPHS, Scene, chunk_squares, html_page, svg, terminal_rows
-from shmmap.cli.screens.status_parts import status_lines
+from shmmap.cli.screens.status_parts import prepare_words, status_lines
 from shmmap.cli.screens.top_screen import budget_parts, screen
 from shmmap.cli.verbs.look.outputs import Prefetching
 from shmmap.client.live.chunk_reader import ChunkInfo
-from shmmap.protocol.rows import CellRow, CellState, ClientRow, LiveMapRow, Window
-from shmmap.statistics.counters import BUCKETS, COUNTERS, HISTOGRAMS
-from shmmap.statistics.identity import DaemonIdentity
-from shmmap.statistics.layout import State, plan
+from shmmap.doctor.verdicts import problems
+from shmmap.protocol.rows import CellRow, CellState, LiveMapRow, Window
+from shmmap.statistics.counters import BUCKETS, HISTOGRAMS
 from shmmap.statistics.reader import Snapshot
-
-MIB = 1 << 20
-IDENTITY = DaemonIdentity(
-    77, 1, 1, 5, "unit", "/run/x.sock", "/maps/city", 7, "/dev/shm", "/maps/", "1.2.3", 5 * 10**9
-)
-CLIENT = ClientRow(
-    3, 4242, 1000, 1000, "localization", "python3", 12, 5 * MIB, 1234, 9 * 10**9,
-    (50.0, 30.0), 0.5, Window("circle", 50.0, 30.0, 25.0, 25.0),
-)  # fmt: skip
+from tests.support.made_statistics import CLIENT, FULL, IDENTITY, MIB, counters, snapshot
 
 
-def counters(**values: int) -> dict[str, int]:
-    assert set(values) <= {c.name for c in COUNTERS}
-    return {c.name: values.get(c.name, 0) for c in COUNTERS}
-
-
-def snapshot(values: dict[str, int], clients: list[ClientRow], *, state: str = "healthy") -> Snapshot:
-    durations = [0] * (len(HISTOGRAMS) * (1 + BUCKETS))
-    durations[1 + 40] = 99  # of the first histogram
-    durations[1 + 60] = 1
-    beat = State(1, 10 * 10**9, 0, 0, 0, tuple(values.values()), len(clients), durations)
-    found = Snapshot(state, IDENTITY, plan(COUNTERS, HISTOGRAMS), beat, beat_age_s=0.1)  # type: ignore[arg-type]
-    found.__dict__["clients"] = clients
-    return found
-
-
-def text(found: Snapshot, *, width: int = 100, max_clients: int = 10) -> str:
-    lines = screen(found, IDENTITY, width=width, max_clients=max_clients)
+def text(found: Snapshot, *, width: int = 100) -> str:
+    lines = screen(found, IDENTITY, width=width)
     return "\n".join("".join(piece for piece, _ in line) for line in lines)
-
-
-FULL = counters(
-    budget_bytes=100 * MIB, bytes_resident=60 * MIB, bytes_pinned=50 * MIB, bytes_zombie=10 * MIB,
-    bytes_reserved=4 * MIB, bytes_statistics=MIB, hits=90, misses=10,
-    hits_10s=3, misses_10s=1, map_cells=1234,
-    sessions=1,
-)  # fmt: skip
 
 
 def test_the_budget_is_split_without_a_rest() -> None:
@@ -70,10 +38,32 @@ def test_the_budget_is_split_without_a_rest() -> None:
     assert budget_parts(crowded)["free"] == 0
 
 
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({}, ""),
+        ({"prepare_failed": 3}, ", 3 cannot be made: the log names them"),
+        (
+            {"prepare_failed": 3, "prepare_retries": 2},
+            ", 3 cannot be made: the log names them (2 will be tried again: the loader was killed)",
+        ),
+        ({"prepare_short": 1}, "; no more: --cache-size is too small for them"),
+        (
+            {"prepare_short": 2},
+            "; waiting: the cache directory is full or cannot be written",
+        ),
+    ],
+)
+def test_status_says_how_far_the_prepared_layers_are(values: dict[str, int], words: str) -> None:
+    found = counters(prepare_cells=4000, prepare_done=1200, **values)
+    assert prepare_words(found, "ndt(leaf=2.0)") == f"ndt(leaf=2.0): 1,200 of 4,000 cells{words}"
+    assert prepare_words(found, "") == ""
+
+
 @pytest.mark.parametrize("width", [40, 80, 100, 250])
 def test_the_bar_is_as_long_as_there_is_room(width: int) -> None:
     lines = text(snapshot(FULL, []), width=width).splitlines()
-    bar = next(line for line in lines if "██" in line).strip()
+    bar = next(line for line in lines if "██" in line).removeprefix("memory").strip()
     assert len(bar) == width - 14
     assert [bar.count(glyph) for glyph in "█▓▒░·"] == pytest.approx(
         [share * len(bar) for share in (0.4, 0.2, 0.1, 0.05, 0.25)], abs=1.0
@@ -90,7 +80,7 @@ def test_the_screen_answers_what_an_operator_asks() -> None:
 
 
 def test_a_daemon_that_does_not_beat_says_so() -> None:
-    assert "PAUSED  no heartbeat" in text(snapshot(FULL, [], state="stopped"))
+    assert "PAUSED, no heartbeat" in text(snapshot(FULL, [], state="stopped"))
     assert "no client is connected" in text(snapshot(counters(), []))
     assert "HUNG" in text(snapshot(FULL, [], state="hung"))
 
@@ -172,18 +162,20 @@ TROUBLED = replace(
 )
 
 
-def test_status_has_a_line_for_each_live_map_and_one_for_each_problem() -> None:
+def test_status_has_a_line_for_each_live_map_and_its_verdict_the_problems() -> None:
     assert status_lines([], 0) == []
     assert status_lines([LIVE], 0) == [
-        ("live lidar", "12 chunks, 4.0 MiB of 16.0 MiB, 1,234,567 known voxels, 4 not saved")
+        ("live lidar", "12 chunks, 4.0 MiB of 16.0 MiB, 1,234,567 voxels known, 4 not saved")
     ]
     assert status_lines([replace(LIVE, dirty=0, saving=0)], 0)[0][1].endswith(", all saved")
-    (_, memory), *problems = status_lines([TROUBLED], 3)
+    found = snapshot(FULL, [])
+    found.live = [TROUBLED]
+    (_, memory), (_, ended) = status_lines([TROUBLED], 3)
     assert memory.startswith("12 chunks, 4.0 MiB of 16.0 MiB")
-    assert [text.partition(":")[0] for _, text in problems] == [
-        "chunk 1_-2_0 cannot be saved",
-        "damaged files, missing chunks",
-        "the process that keeps live maps ended 3 times",
+    assert ended.startswith("the process that keeps live maps ended 3 times")
+    assert [(one.state, one.fact) for one in problems(found)] == [
+        ("fail", f"live map radar: {TROUBLED.problem}"),
+        ("warn", "live map radar: 2 lost chunks or damaged databases"),
     ]
 
 
@@ -191,19 +183,19 @@ def test_status_has_a_line_for_each_live_map_and_one_for_each_problem() -> None:
 def test_live_maps_on_the_screen(width: int) -> None:
     found = snapshot(FULL, [CLIENT])
     assert "live" not in text(found).split()
-    found.__dict__["live"] = [LIVE, TROUBLED]
+    found.live = [LIVE, TROUBLED]
     shown = text(found, width=width)
-    live = shown[shown.index("\nlive ") : shown.index("\nCLIENT")]
+    live = shown[shown.index("\nlive ") : shown.index("\nrequests")]
     assert max(map(len, live.splitlines())) <= width
     words = " ".join(live.split())
     for piece in (
-        "live lidar: 12 chunks 8 clean 3 dirty 1 saving 4.0 MiB of 16.0 MiB 1,234,567 known voxels",
+        "live lidar: 12 chunks 8 clean 3 dirty 1 saving 4.0 MiB of 16.0 MiB 1,234,567 voxels known",
         "scans 100, on disk 93", "radar: 12 chunks", "waiting 1.0 MiB",
         "chunk 1_-2_0 cannot be saved: No space left on device",
-        "damaged files, missing chunks: 2;",
+        "lost chunks, damaged databases: 2;",
     ):  # fmt: skip
         assert piece in words, piece
-    lines = screen(found, IDENTITY, width=width, max_clients=1)
+    lines = screen(found, IDENTITY, width=width)
     styles = {piece.split()[-1]: style for line in lines for piece, style in line if piece.strip()}
     assert (styles["clean"], styles["dirty"], styles["saving"]) == ("green", "blue", "cyan")
 
@@ -215,13 +207,6 @@ def test_a_name_cannot_draw_on_the_screen() -> None:
         assert all(line.isprintable() for line in shown.splitlines())
         rows = [line for line in shown.splitlines() if "4242" in line]
         assert len({line.index("4242") for line in rows}) == 1, "columns stay aligned"
-
-
-def test_more_clients_than_lines_are_counted() -> None:
-    many = [replace(CLIENT, session=n) for n in range(30)]
-    shown = text(snapshot(FULL | {"sessions": 300}, many), max_clients=5)
-    assert shown.count("localization") == 5
-    assert "and 295 more" in shown
 
 
 def cell(name: str, x: float, y: float, state: CellState) -> CellRow:
@@ -244,7 +229,7 @@ def test_the_terminal_picture_has_north_on_top() -> None:
     grid = terminal_rows(SCENE, 50, 30)
     assert (len(grid[0]), len(grid)) == (50, 15)  # characters are twice as high as wide
     assert grid[-1][0] == "resident"
-    assert grid[0][-1] == "zombie"
+    assert grid[0][-1] == "retired"
     assert grid[-1][-1] == "resident"  # of a cell's segments the one that can be handed out is shown
     assert grid[0][0] == "disk"
     assert grid[7][25] == "client"
@@ -280,12 +265,12 @@ def test_cells_fetched_ahead_are_marked_until_a_client_asks() -> None:
     rows = [ahead, both, cell("80_0.pcd", 80, 0, "resident"), cell("40_0.pcd", 40, 0, "stale")]
     scene = Scene(**{**vars(SCENE), "rows": rows, "clients": []})
     grid = terminal_rows(scene, 50, 30)
-    assert grid[-1][0] == "fetched"
+    assert grid[-1][0] == "ahead"
     assert grid[-1][-1] == "resident", "a layer of it was asked for"
     assert grid[-1][20] == "stale"
     picture = svg(scene)
     ElementTree.fromstring(picture)
-    assert picture.count('class="cell fetched"') == 2, "it, and in the legend"
+    assert picture.count('class="cell ahead"') == 2, "it, and in the legend"
     assert "points: fetched ahead, 4.0 KiB" in picture
     assert "fetched ahead</text>" in picture
 
@@ -318,7 +303,7 @@ def test_chunks_of_a_live_map_from_above() -> None:
     ]  # fmt: skip
     lines = squares[1].title.splitlines()
     assert [line.split(",")[0] for line in lines] == ["0_0_-1", "0_0_0", "0_0_1"]
-    assert "z -32 to 0 m: not saved yet, 4.0 KiB, 7 known voxels" in lines[0]
+    assert "z -32 to 0 m: not saved yet, 4.0 KiB, 7 voxels known" in lines[0]
     scene = Scene((-32.0, 0.0, 64.0, 32.0), [], [], [], 0, "live map lidar", "", chunks=squares)
     assert terminal_rows(scene, 6, 1) == [["saved", "saved", "dirty", "dirty", "loading", "loading"]]
     picture = svg(scene)

@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import re
 
 import pytest
 
@@ -16,6 +18,7 @@ from shmmap.cli.screens.output import (
     print_pairs,
     print_table,
 )
+from shmmap.cli.verbs.look.status import _CLIENT_COLUMNS
 from tests.unit.cli.screens.conftest import Terminal
 
 COLUMNS = (Column("CELL"), Column("POINTS", "right"))
@@ -52,7 +55,7 @@ WIDE_ROWS = [["town_0_0.pcd", "100", "200", "0123456789abcdef"]]
 
 @pytest.mark.parametrize(
     ("columns", "names"),
-    [(43, ["CELL", "X", "Y", "ID"]), (42, ["CELL", "X", "Y"]), (24, ["CELL", "X", "Y"]), (23, ["CELL"])],
+    [(40, ["CELL", "X", "Y", "ID"]), (39, ["CELL", "X", "Y"]), (22, ["CELL", "X", "Y"]), (21, ["CELL"])],
 )
 def test_a_narrow_terminal_goes_without_spare_columns(columns: int, names: list[str]) -> None:
     assert [WIDE[index].name for index in columns_that_fit(WIDE, WIDE_ROWS, columns)] == names
@@ -63,6 +66,39 @@ def test_a_wide_column_takes_no_other_with_it() -> None:
     rows = [["town_0_0.pcd", "voxel(leaf=0.5,of=crop(z_max=12.0))", "100"]]
     assert columns_that_fit(columns, rows, 30) == [0, 2]
     assert columns_that_fit(columns, rows, 52) == [0, 1]
+
+
+@pytest.mark.usefixtures("terminal")
+@pytest.mark.parametrize(
+    "name", ["localization", "perception_of_the_front_left_camera_and_the_lidar_behind_it_no_1"]
+)
+@pytest.mark.parametrize("width", [40, 80, 120])
+def test_clients_on_any_terminal(monkeypatch: pytest.MonkeyPatch, width: int, name: str) -> None:
+    """A long name is folded before columns go; what matters most stays."""
+    row = [
+        name,
+        "15230",
+        "operator",
+        "1,234",
+        "728 KiB",
+        "572 KiB",
+        "-",
+        "12,345",
+        "20.5 s",
+        "-100.5,90.1",
+        "python3",
+    ]
+    monkeypatch.setenv("COLUMNS", str(width))
+    monkeypatch.setattr("sys.stdout", terminal := Terminal())
+    print_table(_CLIENT_COLUMNS, [row])
+    lines = re.sub(r"\x1b\[[0-9;]*m", "", terminal.getvalue()).splitlines()
+    assert max(len(line) for line in lines if "hidden" not in line) <= width
+    assert lines[0].split()[0] == "CLIENT"
+    assert {"GIVEN"} <= set(lines[0].split())
+    if width >= 80:
+        assert {"PID", "CELLS", "GIVEN", "MAPPED", "OUTDATED"} <= set(lines[0].split())
+    table = itertools.takewhile(lambda line: not line.startswith("hidden"), lines[1:])
+    assert "".join(line.split()[0] for line in table) == name
 
 
 @pytest.mark.usefixtures("terminal")
@@ -77,10 +113,12 @@ def test_a_table_is_never_wider_than_the_terminal(monkeypatch: pytest.MonkeyPatc
 
 def test_a_narrow_terminal_shows_what_is_missing(terminal: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.stdout", terminal)
-    monkeypatch.setenv("COLUMNS", "23")
+    monkeypatch.setenv("COLUMNS", "21")
     print_table(WIDE, WIDE_ROWS)
     assert "town_0_0.pcd" in terminal.getvalue()
-    assert "hidden (narrow terminal): X, Y, ID" in terminal.getvalue()
+    *_, first, second = terminal.getvalue().splitlines()
+    assert "hidden (narrow" in first
+    assert "terminal): X, Y, ID" in second
     assert "100" not in terminal.getvalue()
 
 

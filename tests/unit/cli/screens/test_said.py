@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import ast
 import json
+import re
 from typing import Any
 
 import pytest
@@ -15,6 +17,7 @@ from shmmap.errors import CellError, LoadFailed, OverBudget
 from shmmap.lacking import failure_lines
 from shmmap.protocol import events as e
 from shmmap.protocol.messages import Holder
+from tests.support.daemon_process import ROOT
 
 
 @pytest.mark.parametrize(
@@ -118,3 +121,40 @@ def test_holders_in_json() -> None:
     assert json_output.Holder.of(NDT) == json_output.Holder(
         "00000000000000ab", 42, 1000, user_name(1000), "ndt", "python3", 30, 921600
     )
+
+
+IN_GB = {"ros_bridge/cli.py", "ros_cells/point_cloud.py"}
+"""Messages of ROS 2, whose largest has 2.147 GB; the option that limits them is in GB."""
+
+
+def test_sizes_and_counts_are_written_alike() -> None:
+    """KiB, MiB and GiB, and commas in thousands; the texts of `.ci/words.txt` are another matter."""
+    for path in (*(ROOT / "shmmap").rglob("*.py"), *(ROOT / "clients/shmmap_clients").rglob("*.py")):
+        if any(str(path).endswith(name) for name in IN_GB):
+            continue
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        prose = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in prose:
+                assert not re.search(r"\b[kMG]B\b|\d \d{3} \d{3}", node.value), (path, node.lineno)
+
+
+def test_the_old_words_are_refused() -> None:
+    words = (ROOT / ".ci/words.txt").read_text(encoding="utf-8")
+    patterns = [line.rpartition(" #")[0].strip() for line in words.splitlines() if not line.startswith("#")]
+    refused = re.compile(
+        "|".join(f"(?<![a-z`])(?:{re.sub(r'[(][?]-i:', '(?:', one)})(?![a-z])" for one in patterns), re.I
+    )
+    gone, old = "zombie", "active"
+    for text in (f"a {gone}", f"{gone}s", f"is_{gone}", f"{gone}_count", f"12 {old} cells", f"{old}_voxels"):
+        assert refused.search(text), text
+    for text in (
+        "`zombie`",
+        '"zombie"',
+        "NAME.zombie",
+        "bytes_zombie",
+        "zombie_bytes",
+        "total_active_cells",
+        "retired",
+    ):
+        assert not refused.search(text), text

@@ -98,3 +98,11 @@ def test_fields_are_chosen(tmp_path: Path, verb: Verb) -> None:
     write_pcd(tmp_path / "in" / "b.pcd", {axis: np.ones(2, np.float32) for axis in "xyz"})
     assert main([*words, "--force"]) == 65
     assert main([*words, "--force", "--fields", "x,y,z"]) == 0
+
+
+def test_a_check_says_that_it_passed(tmp_path: Path, verb: Verb) -> None:
+    cloud(tmp_path / "a.pcd", 0)
+    words = ["divide", str(tmp_path / "a.pcd"), str(tmp_path / "map"), "--quiet", "--force"]
+    checked = verb([*words, "--check"]).out
+    assert re.search(r"^check +passed: 10 points read back, each in its cell$", checked, re.MULTILINE)
+    assert "\ncheck " not in verb(words).out

@@ -5,13 +5,18 @@ from __future__ import annotations
 
 import json
 import shutil
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
+from shmmap.chunks.voxels import ChunkKey
 from shmmap.daemon.live.disk.folder import Folder
+from shmmap.daemon.live.disk.map_files import MapFiles
 from tests.support.divided_map import read_pcd
-from tests.support.live_reference import contents, stored_drive
+from tests.support.live_drive import SETTINGS
+from tests.support.live_reference import contents, old_directory, stored_drive
+from tests.support.stored_chunks import PAGE, change_chunk, chunk_sizes, damage_page, largest
 from tests.unit.conftest import Verb
 
 
@@ -21,43 +26,50 @@ def directory(tmp_path: Path) -> Path:
     return tmp_path / "lidar"
 
 
-def damage(directory: Path) -> Path:
-    path = max(directory.glob("*.chunk"), key=lambda path: path.stat().st_size)
-    path.write_bytes(path.read_bytes()[:-5])
-    return path
+def damage(directory: Path) -> str:
+    """Damage a chunk; return its key."""
+    key = largest(directory)
+    change_chunk(directory, key, lambda data: data[:-5])
+    return key.text
 
 
 def test_a_good_map_is_checked(directory: Path, verb: Verb) -> None:
     said = verb(["live", "fsck", str(directory)])
+    sizes = chunk_sizes(directory)
     assert said.err == ""
-    assert f"{len(list(directory.glob('*.chunk')))} chunks" in said.out
+    assert f"{len(sizes)} chunks" in said.out
     found = json.loads(verb(["live", "fsck", "--json", str(directory)]).out)
     assert found["good"] is True
-    assert found["chunks"] == len(list(directory.glob("*.chunk")))
+    assert found["chunks"] == len(sizes)
     assert found["active"] == found["occupied"] + found["free"] > 100
-    assert found["bytes"] == sum(path.stat().st_size for path in directory.glob("*.chunk"))
-    assert (found["manifest"], found["rewritten"], found["damaged"]) == ("current", False, [])
+    assert found["bytes"] == sum(sizes.values())
+    assert (found["lost"], found["rebuilt_from"], found["damaged"]) == ([], "", "")
 
 
 def test_a_damaged_map_is_checked_and_repaired(directory: Path, verb: Verb) -> None:
-    path = damage(directory)
+    key = damage(directory)
     before = contents(directory)
     said = verb(["live", "fsck", str(directory)], 65)
-    assert f"damaged: {path.name}: " in said.out
-    assert "hint: --repair" in said.err
+    assert f"lost: chunk {key}: version " in said.out
+    assert "let --repair" in said.err
     assert contents(directory) == before
-    (damaged,) = json.loads(verb(["live", "fsck", "--repair", "--json", str(directory)], 65).out)["damaged"]
-    assert damaged["file"] == path.name
-    assert damaged["kept_as"] == f"{path.name}.damaged.1"
-    assert (directory / damaged["kept_as"]).read_bytes() == before[path.name]
-    assert damaged["kept_as"] in verb(["live", "fsck", str(directory)]).out
+    found = json.loads(verb(["live", "fsck", "--repair", "--json", str(directory)], 65).out)
+    assert [one["chunk"] for one in found["lost"]] == [key]
+    assert found["rebuilt_from"] == "map.db.damaged.1"
+    assert (directory / "map.db.damaged.1").read_bytes() == before["map.db"]
+    assert "map.db.damaged.1" in verb(["live", "fsck", str(directory)]).out
 
 
-def test_a_missing_chunk(directory: Path, verb: Verb) -> None:
-    path = max(directory.glob("*.chunk"))
-    path.unlink()
+def test_damaged_tables(directory: Path, verb: Verb) -> None:
+    keys = chunk_sizes(directory)
+    damage_page(directory, 1, bytes(PAGE))
+    before = contents(directory)
     said = verb(["live", "fsck", str(directory)], 65).out
-    assert f"missing: chunk {path.name.removesuffix('.chunk')}: " in said
+    assert "damaged: its tables are damaged: file is not a database" in said
+    assert contents(directory) == before
+    found = json.loads(verb(["live", "fsck", "--repair", "--json", str(directory)], 65).out)
+    assert (found["chunks"], found["lost"]) == (len(keys), [])
+    verb(["live", "fsck", str(directory)])
 
 
 def test_while_another_process_works_with_it(directory: Path, verb: Verb, tmp_path: Path) -> None:
@@ -82,15 +94,42 @@ def test_no_live_map(tmp_path: Path, verb: Verb, words: list[str]) -> None:
     assert contents(tmp_path) == {"mine": b"mine"}
 
 
+@pytest.mark.parametrize("words", [["fsck"], ["export", "-o", "x.ply"], ["reset", "--yes"]])
+def test_a_name_that_no_live_map_has(
+    tmp_path: Path, verb: Verb, words: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    monkeypatch.setenv("SHMMAP_INSTANCE", "town")
+    assert "no live map is set up" in verb(["live", *words, "roof"], 66).err
+    for name in ("lidar", "rear"):
+        stored_drive(tmp_path / "shmmap/town/live" / name, 0)
+    said = verb(["live", *words, "lidra"], 66).err
+    assert "neither a directory nor a live map 'lidra'\nhint: live maps here: lidar, rear\n" in said
+    assert "0 chunks" in verb(["live", "fsck", "lidar"]).out
+
+
 def test_a_map_whose_record_is_unreadable(directory: Path, verb: Verb) -> None:
     (directory / "map.json").write_bytes(b"{")
+    verb(["live", "fsck", str(directory)])
+    damage_page(directory, 1, bytes(PAGE))
+    damage_page(directory, 2, bytes(PAGE))
     before = contents(directory)
     said = verb(["live", "fsck", "--repair", str(directory)], 65).err
-    assert "map.json" in said
-    assert "hint: bring the file back" in said
+    assert "not a database" in said
     assert contents(directory) == before
     verb(["live", "reset", str(directory), "--yes"])
     assert contents(directory / "reset.1") == before
+
+
+def test_a_map_of_an_earlier_version(tmp_path: Path, verb: Verb) -> None:
+    """Nothing reads it but the daemon's start, which imports it; it can be put aside."""
+    old_directory(tmp_path / "old", 2)
+    before = contents(tmp_path / "old")
+    for words in (["fsck"], ["fsck", "--repair"], ["export", "-o", str(tmp_path / "x.ply")]):
+        assert "shmmap serve --live NAME=DIR" in verb(["live", *words, str(tmp_path / "old")], 65).err
+    assert contents(tmp_path / "old") == before
+    verb(["live", "reset", str(tmp_path / "old"), "--yes"])
+    assert contents(tmp_path / "old" / "reset.1") == before
 
 
 def test_exports(directory: Path, verb: Verb, tmp_path: Path) -> None:
@@ -110,14 +149,16 @@ def test_exports(directory: Path, verb: Verb, tmp_path: Path) -> None:
 
 
 def test_exports_of_a_damaged_map(directory: Path, verb: Verb, tmp_path: Path) -> None:
-    path = damage(directory)
+    key = damage(directory)
     words = ["live", "export", str(directory), "-o", str(tmp_path / "out.ply")]
     assert "hint: `shmmap live fsck`" in verb(words, 65).err
     assert not (tmp_path / "out.ply").exists()
-    verb(["live", "fsck", "--repair", str(directory)], 65)
+    with closing(Folder(directory)) as folder, closing(MapFiles(folder, SETTINGS)) as files:
+        assert files.load(ChunkKey.from_text(key)) is None  # as a daemon that finds it
+        files.write_record()
     said = verb([*words, "--json"])
-    assert f'"{path.name}.damaged.1"' in said.out
-    assert "1 damaged file in quarantine" in said.err
+    assert json.loads(said.out)["lost"] == [key]
+    assert f"what is lost of 1 chunk: {key}" in said.err
 
 
 def test_nothing_to_export(tmp_path: Path, verb: Verb) -> None:

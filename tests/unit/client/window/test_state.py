@@ -10,7 +10,7 @@ import pytest
 
 from shmmap.client.cell import Cell
 from shmmap.client.cell_set import PendingLayer
-from shmmap.client.window.state import EMPTY, WindowState, moved, update_between
+from shmmap.client.window.state import EMPTY, WindowState, WindowUpdate, moved, update_between
 from shmmap.errors import CellError, LoadFailed, OverBudget
 from shmmap.geometry import Area, AutowareSquare, Box, Circle
 from shmmap.protocol.messages import Intent
@@ -140,3 +140,10 @@ def test_areas_that_contain_a_circle(
 ) -> None:
     assert area.contains_circle(*inside)
     assert not area.contains_circle(*outside)
+
+
+def test_an_update_prints_as_one_line() -> None:
+    update = WindowUpdate(removed=("/map/a.pcd", "/map/b.pcd"))
+    assert repr(update) == (
+        "<WindowUpdate: 0 added, 0 kept, 0 changed, 2 removed, 0 pending, 0 failed, of an earlier pose>"
+    )

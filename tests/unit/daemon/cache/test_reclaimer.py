@@ -34,7 +34,7 @@ class Memory:
         self.directory = directory
         self.ledger = Ledger(1 << 40)
         self.pins = PinWatch(directory, events=True)
-        nothing: Any = SimpleNamespace(segment_retired=lambda *_: None, segment_gone=lambda *_: None)
+        nothing: Any = SimpleNamespace(segment_retired=lambda *_: None)
         self.reclaimer = Reclaimer(self.ledger, directory, Sessions(), self.pins, nothing)
         self.evictor = Evictor(self.reclaimer)
         self.looks = 0

@@ -20,7 +20,6 @@ from shmmap.protocol import messages as m
 from shmmap.protocol.codec import pack_versions
 from shmmap.protocol.messages import Area, CircleMessage, Differential, Metadata, Selected
 from shmmap.segment.names import retired_name
-from shmmap.statistics.reader import read_statistics
 from tests.support.divided_map import DividedMap, make_map
 from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner, InnerDaemon, names
 
@@ -206,10 +205,8 @@ def taken(one: InnerDaemon, name: str) -> Iterator[None]:
 
 
 def shown(one: InnerDaemon) -> dict[str, str]:
-    """Segments and their states in the statistics."""
-    one.cache.events.flush()
-    one.statistics.beat()
-    return {cell.segment: cell.state for cell in read_statistics("inner", one.shm_dir).cells}
+    """Segments and their states in the daemon's list."""
+    return {cell.segment: cell.state for cell in one.listed()}
 
 
 def test_the_name_of_a_retired_segment(inner: Inner, small_map: DividedMap) -> None:

@@ -12,6 +12,7 @@ import pytest
 
 from shmmap.daemon.live.chunk_memory import ChunkMemory
 from shmmap.daemon.live.disk.folder import Folder
+from shmmap.daemon.live.disk.map_files import MapFiles
 from shmmap.daemon.live.paged_map import PagedMap
 from tests.support.served_map import Served
 
@@ -20,10 +21,10 @@ from tests.support.served_map import Served
 def closed_maps(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Close what a test left open: maps, their memory and their directories."""
     opened: dict[int, Any] = {}
-    for kind in (PagedMap, ChunkMemory, Folder):
+    for kind in (PagedMap, MapFiles, ChunkMemory, Folder):
         _follow(kind, opened, monkeypatch)
     yield
-    for one in sorted(opened.values(), key=lambda one: not isinstance(one, PagedMap)):
+    for one in sorted(opened.values(), key=lambda one: not isinstance(one, PagedMap | MapFiles)):
         one.close()
 
 
@@ -35,9 +36,9 @@ def _follow(kind: Any, opened: dict[int, Any], monkeypatch: pytest.MonkeyPatch) 
         begin(self, *arguments, **options)
         opened[id(self)] = self
 
-    def close(self: Any) -> None:
+    def close(self: Any, *arguments: Any) -> None:
         opened.pop(id(self), None)
-        end(self)
+        end(self, *arguments)
 
     monkeypatch.setattr(kind, "__init__", init)
     monkeypatch.setattr(kind, "close", close)

@@ -66,7 +66,7 @@ class World:
         self.wait: Callable[[float], None] = self.pass_time
         monkeypatch.setattr(relay, "start_child", self._start)
         monkeypatch.setattr(relay, "time", SimpleNamespace(monotonic=lambda: self.now_s))
-        shown = SimpleNamespace(set=lambda *_: None, show_live_maps=lambda _: None, beat=lambda: None)
+        shown = SimpleNamespace(set=lambda *_: None, beat=lambda: None)
         events = LiveEvents(EventLog(1), cast("StatisticsWriter", shown))
         self.relay = LiveRelay(BEGIN, self.watched, lambda peer, _now_s: peer.pid != 2, events)
         monkeypatch.setattr(self.relay, "_wait", lambda seconds: self.wait(seconds))

@@ -343,9 +343,8 @@ def test_a_cell_that_can_never_fit_keeps_no_other_one_out(
 
 
 def shown_ahead(one: InnerDaemon) -> dict[str, bool]:
-    """Return of each cell that the statistics show whether it was fetched ahead."""
-    rows = {**one.statistics._missing, **one.statistics._changed}
-    return {row.id: row.ahead for row in rows.values()}
+    """Return of each cell in the daemon's list whether it was fetched ahead."""
+    return {row.id: row.ahead for row in one.listed()}
 
 
 def test_cells_fetched_ahead_are_events_and_shown_until_a_client_asks(
@@ -364,8 +363,6 @@ def test_cells_fetched_ahead_are_events_and_shown_until_a_client_asks(
     assert loaded == dict.fromkeys(asked_for, False) | dict.fromkeys(wished, True)
     assert shown_ahead(one) == loaded
     assert len(one.cells_for(Selected(2, ("0_0.pcd",), wait=30.0)).cells) == 1
-    while one.cache.show_used(one.now_s()):
-        pass
     assert shown_ahead(one) == loaded | {"0_0.pcd": False}
     assert [count(one, name) for name in ("prefetch_started", "prefetch_used", "prefetch_misses")] == [
         6,

@@ -23,8 +23,9 @@ from tests.support.map_stores import MemoryStore
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 
+from shmmap.daemon.map.arrivals import Arrivals
 from shmmap.daemon.map.published_view import PublishedView
-from shmmap.daemon.map.shard_pages import BACKGROUND_FETCHES, THREADS, ShardFetcher, ShardPages
+from shmmap.daemon.map.shard_pages import BACKGROUND_FETCHES, FEW_SHARDS, THREADS, ShardFetcher, ShardPages
 from shmmap.layers.spec import layer_spec
 from shmmap.origin.remote.map_versions import read_shard_object
 from shmmap.origin.remote.published_index import (
@@ -117,7 +118,7 @@ class Served:
     failed: list[None] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.fetcher = ShardFetcher(cast("Store", self.store), lambda: self.failed.append(None))
+        self.fetcher = ShardFetcher(cast("Store", self.store), lambda: self.failed.append(None), Arrivals())
 
     def view(
         self, root: Root, before: PublishedView | None = None, max_bytes: int = 1 << 40
@@ -268,6 +269,7 @@ def test_what_is_not_here_is_not_known(served: Served) -> None:
     served.store.open.clear()  # nothing comes in the background
     view = served.view(publish(served.store, cells))
     pages = view.pages
+    assert len(pages) > FEW_SHARDS
     assert view.query(Circle(0, 0, 400))[1] is False
     assert view.query(Circle(5000, 0, 1))[1] is True
     with pytest.raises(KeyError):
@@ -275,10 +277,6 @@ def test_what_is_not_here_is_not_known(served: Served) -> None:
     here = range(0, len(pages), 2)
     served.store.open.set()
     fetch(pages, here)
-    while not view.complete:
-        collect(pages)
-    for number in range(1, len(pages), 2):
-        pages.drop(number)
     known = {name for number in here for name in view.ids(np.array(pages.cells(number)))}
     assert pages.known_cells == len(known)
     for area in areas(rng):
@@ -297,8 +295,8 @@ def test_the_rest_comes_in_the_background_while_it_fits(served: Served) -> None:
     pages = map(whole.pages.page, range(len(whole.pages)))
     view = served.view(root, max_bytes=sum(page.nbytes for page in pages if page is not None) // 3)
     fetch(view.pages, view.pages.of_area(Circle(700, 700, 50)))
-    while select.select([view.pages.fd], [], [], 0.5)[0]:
-        view.pages.collect()
+    while view.pages.want_nearest((700.0, 700.0)):
+        collect(view.pages)
     assert 0.2 < view.pages.known_cells / 3000 < 0.34
     assert view.pages.spare() is None
     assert view.query(Circle(700, 700, 200))[1], "the nearest ones come first"
@@ -319,7 +317,7 @@ def test_what_an_area_needs_comes_before_the_background(served: Served) -> None:
     root = publish(served.store, some_cells(np.random.default_rng(5), 3000, width=3000.0))
     served.store.open.clear()
     view = served.view(root)
-    view.pages.collect()
+    assert [view.pages.want_nearest(None) for _ in range(3)] == [True, True, False]
     begun = Deadline()
     while begun(len(served.store.asked) < BACKGROUND_FETCHES):
         time.sleep(0.001)

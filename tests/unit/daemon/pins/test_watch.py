@@ -69,23 +69,23 @@ def test_use(directory: ShmDirectory, source: PinSource, lock: int | None, used:
 
 def test_closes_of_a_kept_segment_are_reported(directory: ShmDirectory) -> None:
     pins = PinWatch(directory, events=True)
-    zombie = NAME + ".zombie"
+    retired = NAME + ".zombie"
     descriptors = len(os.listdir("/proc/self/fd"))
     mapping = map_segment(directory.path + NAME, 5)
-    directory.rename(NAME, zombie)
-    assert pins.keep(zombie)
+    directory.rename(NAME, retired)
+    assert pins.keep(retired)
     for _ in range(3):
-        assert pins.is_used(zombie) is True
-    with pins.opened(zombie) as fd:
+        assert pins.is_used(retired) is True
+    with pins.opened(retired) as fd:
         assert fd > 0
     assert not reported(pins.fd, 0)  # its own looks are not reported
     mapping.close()
     assert reported(pins.fd)
-    assert pins.closed() == {zombie}
-    assert pins.is_used(zombie) is False
-    directory.unlink(zombie)  # its memory goes when it is released
-    pins.release(zombie)
-    assert not pins.keeps(zombie)
+    assert pins.closed() == {retired}
+    assert pins.is_used(retired) is False
+    directory.unlink(retired)  # its memory goes when it is released
+    pins.release(retired)
+    assert not pins.keeps(retired)
     assert len(os.listdir("/proc/self/fd")) == descriptors
     assert pins.closed() == set()
     pins.close()

@@ -120,6 +120,41 @@ def test_nothing_stays_of_requests_that_are_over(inner: Inner, small_map: Divide
     assert one.statistics.values["loads_finished"] == 16, "each load has ended once"
 
 
+def test_cancelled_requests(inner: Inner, small_map: DividedMap) -> None:
+    """All copies of one id, of this session alone; each leaves its place to another one."""
+    one = inner(small_map.root)
+    session, other = one.session(), one.session()
+    with one.loaders_standing_still():
+        for request in (*range(1, 64), 1, 70):
+            one.ask(session, Area(request, EVERYWHERE, wait=30.0))
+        one.ask(other, Area(1, EVERYWHERE, wait=30.0))
+        assert [reply.request for _, reply in one.replies] == [70], "the 65th does not wait"
+        one.cells.cancel(session, 1)
+        one.cells.cancel(session, 70)
+        one.cells.cancel(session, 9999)
+        assert len(one.cells) == 62 + 1
+        for request in (71, 72):
+            one.ask(session, Area(request, EVERYWHERE, wait=30.0))
+        for request in (*range(2, 64), 71, 72):
+            one.cells.cancel(session, request)
+        assert len(one.cells) == 1
+        assert [reply.request for _, reply in one.replies] == [70]
+    assert len(one.cells_of(1).cells) == 16
+    one.run_until_nothing_waits()
+
+
+def test_a_cancelled_request_whose_answer_is_due(inner: Inner, small_map: DividedMap) -> None:
+    one = inner(small_map.root)
+    one.hold_answers = True
+    session = one.session()
+    one.ask(session, Selected(1, ("0_0.pcd",), wait=30.0))
+    one.run_until(lambda: one.due)
+    one.cells.cancel(session, 1)
+    finish(one.due.pop())
+    assert one.replies == []
+    one.run_until_nothing_waits()
+
+
 def test_waiting_requests_are_answered_in_turn(inner: Inner, small_map: DividedMap) -> None:
     """A load that many waited for answers none by itself: each answer has its own turn, if still wanted."""
     one = inner(small_map.root)

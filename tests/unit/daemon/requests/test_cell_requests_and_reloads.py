@@ -171,7 +171,7 @@ def test_moved_cells_are_loaded_again_with_their_box(inner: Inner, small_map: Di
     one.everything()
     evicted = one.cache.warm.layers["points"][one.cache.index_of("0_0.pcd") or 0]
     with open(one.path_of(evicted.name.rsplit(".", 1)[1]), "rb") as held:
-        one.reclaimer.retire(evicted, one.now_s())  # a zombie while it moves
+        one.reclaimer.retire(evicted, one.now_s())  # retired while it moves
         small_map.corners["0_0.pcd"] = (400, 400)
         small_map.corners["20_20.pcd"] = (500, 500)
         small_map.write_metadata()

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 from hypothesis import given
@@ -13,18 +12,12 @@ from hypothesis import strategies as st
 from shmmap.daemon.loading.look_ahead import IN_A_ROW
 from shmmap.daemon.telemetry.sampler import (
     BEAT_S,
-    CHANGE_BEAT_S,
-    CLIENT_ROWS_PER_BEAT,
     IDLE_AFTER_S,
     IDLE_BEAT_S,
     RecentCounts,
     Sampler,
-    SessionRows,
 )
-from shmmap.daemon.transport.sessions import Sessions
 from shmmap.daemon.turns import WatchedDescriptors
-from shmmap.statistics.layout import MAX_CLIENTS
-from tests.support import connections
 from tests.support.divided_map import DividedMap
 from tests.unit.daemon.inner_daemon import Inner, InnerDaemon
 
@@ -47,39 +40,6 @@ def sampler_of(
         one.cache, one.cache.survey, one.scheduler, one.statistics, one.event_log, one.sessions,
         watched or WatchedDescriptors(), (), on_beat,
     )  # fmt: skip
-
-
-def test_a_change_is_written_soon_and_what_was_only_used_with_the_next_whole_beat(
-    inner: Inner, small_map: DividedMap, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    one = inner(small_map.root)
-    one.everything()
-    whole: list[float] = []
-    sampler = sampler_of(one, lambda: whole.append(now_s))
-    written: list[str] = []
-    write = one.statistics._write_row
-
-    def noted(slot: int, packed: bytes) -> bool:
-        written.extend(str(name) for name, at in one.statistics._slots.items() if at == slot)
-        return write(slot, packed)
-
-    monkeypatch.setattr(one.statistics, "_write_row", noted)
-    now_s = 1000.0
-    beat(sampler, now_s)
-    assert whole == [1000.0]
-    residents: list[Any] = list(one.ledger.residents())
-    one.cache.hand_out(residents, now_s)
-    one.cache.events.show(residents[0], "resident")
-    written.clear()
-    beat(sampler, now_s := 1000.0 + CHANGE_BEAT_S / 2)
-    assert written == []
-    beat(sampler, now_s := 1000.0 + CHANGE_BEAT_S)
-    assert written == [residents[0].name]
-    beat(sampler, now_s := 1000.0 + BEAT_S / 2)
-    assert (written, whole) == ([residents[0].name], [1000.0])
-    beat(sampler, now_s := 1000.0 + BEAT_S)
-    assert set(written) == {resident.name for resident in residents}
-    assert whole == [1000.0, 1000.0 + BEAT_S]
 
 
 def test_an_idle_daemon_sleeps(inner: Inner, small_map: DividedMap) -> None:
@@ -154,37 +114,6 @@ def test_what_limits_prefetching(inner: Inner, small_map: DividedMap) -> None:
     off = inner(small_map.root)
     beat(sampler_of(off), 1000.0)
     assert (off.statistics.values["prefetch_budget_bytes"], off.statistics.values["prefetch_short"]) == (0, 0)
-
-
-def test_rows_of_many_clients_are_updated_a_few_at_a_time() -> None:
-    """The oldest ones first, and only of those that changed."""
-    sessions, rows = Sessions(), SessionRows()
-    clients = [
-        sessions.open(connections.of(), f"{number}", 0.0) for number in range(2 * CLIENT_ROWS_PER_BEAT + 8)
-    ]
-    shown = [len(rows.of(sessions)) for _ in range(4)]
-    assert shown == [CLIENT_ROWS_PER_BEAT, 2 * CLIENT_ROWS_PER_BEAT, len(clients), len(clients)]
-    before = rows.of(sessions)
-    clients[-1].requests = 7
-    assert [new is old for new, old in zip(rows.of(sessions), before, strict=True)].count(False) == 1
-    for client in clients:
-        client.requests += 1
-    requests = [(row.requests, one.requests) for row, one in zip(rows.of(sessions), clients, strict=True)]
-    assert [shown == now for shown, now in requests].count(True) == CLIENT_ROWS_PER_BEAT
-    for _ in range(2):
-        for client in clients[:CLIENT_ROWS_PER_BEAT]:
-            client.requests += 1  # these ask all the time
-        rows.of(sessions)
-    assert all(row.requests for row in rows.of(sessions)), "the others have their turn"
-    sessions.close(clients[0])
-    assert [row.session for row in rows.of(sessions)] == [client.slot for client in clients[1:]]
-
-
-def test_more_clients_than_there_are_rows() -> None:
-    sessions, rows = Sessions(), SessionRows()
-    for _ in range(MAX_CLIENTS + 5):
-        sessions.open(connections.of(), "", 0.0)
-    assert [len(rows.of(sessions)) for _ in range(5)] == [64, 128, 192, MAX_CLIENTS, MAX_CLIENTS]
 
 
 @given(st.lists(st.tuples(st.floats(0.01, 30.0), st.integers(0, 5)), max_size=200))

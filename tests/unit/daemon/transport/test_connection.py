@@ -289,6 +289,29 @@ def test_subscribers_that_do_not_read(loop: Loop) -> None:
     assert numbers == [*range(REMEMBERED + 1)], "the first is the beat of its subscription"
 
 
+def test_subscribers_that_end_with_much_unread(loop: Loop) -> None:
+    """Their end costs no more than another connection's: nothing is offered to them."""
+    log = EventLog(7)
+    offered: list[bool] = []
+
+    def on_read(connection: Connection) -> bool:
+        offered.append(True)
+        return log.resume(connection)
+
+    loop.listener.on_read = on_read
+    unread = [loop.raw(GREETING + READY) for _ in range(20)]
+    for connection in loop.connections:
+        log.subscribe(connection)
+    for number in range(REMEMBERED):
+        log.publish(Changed, f"{number}.pcd", number, "changed")
+    for one in unread:
+        one.close()
+    waiting = Deadline()
+    while waiting(len(loop.ended) < len(unread)):
+        loop.turn()
+    assert offered == []
+
+
 def test_half_a_message_from_each(loop: Loop, other: int) -> None:
     """All together are too much: the process that sent most loses its connections, the others nothing."""
     half = framed(bytes(LONGEST - 100))[:-1]

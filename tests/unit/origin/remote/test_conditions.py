@@ -14,6 +14,7 @@ import pytest
 from shmmap.errors import BadRequest, CannotWrite, ShmmapError
 from tests.support.map_stores import BucketServer
 from tests.support.store_proxy import (
+    IGNORING,
     Answer,
     Asked,
     Forward,
@@ -23,7 +24,6 @@ from tests.support.store_proxy import (
     honest,
     page,
     with_tags,
-    without_headers,
 )
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
@@ -89,10 +89,10 @@ def test_a_good_store_is_asked_four_times_once(proxy: Proxy) -> None:
 
 
 BAD: dict[str, tuple[Rule, type[ShmmapError], str]] = {
-    "no If-None-Match": (without_headers("if-none-match"), CannotWrite, r"ignores .*\(If-None-Match\)"),
-    "no If-Match": (without_headers("if-match"), CannotWrite, r"ignores .*\(If-Match\)"),
+    "no If-None-Match": (IGNORING["If-None-Match"], CannotWrite, r"ignores .*\(If-None-Match\)"),
+    "no If-Match": (IGNORING["If-Match"], CannotWrite, r"ignores .*\(If-Match\)"),
     "neither": (
-        without_headers("if-match", "if-none-match"), CannotWrite, r"\(If-Match and If-None-Match\)",
+        IGNORING["If-Match and If-None-Match"], CannotWrite, r"\(If-Match and If-None-Match\)",
     ),
     "weak": (with_tags(weak, "PUT", "GET", "HEAD"), CannotWrite, "gives weak ETags"),
     "weak and ignored": (

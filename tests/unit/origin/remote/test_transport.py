@@ -15,7 +15,7 @@ import pytest
 from shmmap.errors import ConfigError, Offline, ShmmapError
 from shmmap.processes.request_threads import PREFIX
 from tests.support.daemon_process import Deadline
-from tests.support.web_servers import WRONG_ANSWERS, FaultyWeb, faulty_web
+from tests.support.web_servers import WRONG_ANSWERS, FaultyWeb, endless_error, faulty_web
 
 pytest.importorskip("obstore", reason="obstore is not installed")
 pytest.importorskip("zstandard", reason="zstandard is not installed")
@@ -23,8 +23,11 @@ pytest.importorskip("zstandard", reason="zstandard is not installed")
 from shmmap.origin.remote.map_versions import refuse_if_signed
 from shmmap.origin.remote.opened_store import open_store
 from shmmap.origin.remote.store import Store, StoreRefused, Timeouts
+from shmmap.origin.remote.transport import reporting_bytes
 
-ONCE = Timeouts(connect_s=5.0, read_s=0.5, retries=0, retry_s=0.0)
+ONCE = Timeouts(connect_s=30.0, read_s=30.0, retries=0, retry_s=0.0)
+SOON = Timeouts(connect_s=5.0, read_s=0.5, retries=0, retry_s=0.0)
+"""For answers that never end; where one that does is read, a busy machine may take longer."""
 AGAIN = Timeouts(connect_s=5.0, read_s=5.0, retries=4, retry_s=60.0)
 TEXT = b'{"version": 1, "root": "ab", "bytes": 12}'
 SECRET = "of-the-session"
@@ -81,14 +84,17 @@ READ_OF = {
     "closed": ("no answer", "no answer"),
 }  # fmt: skip
 """What is said when an object is read from a web server, and from a bucket."""
+ENDLESS = {"drip head", "continue", "drip body", "drip error", "drip chunks"}
 
 
 @pytest.mark.parametrize("scheme", ["http", "s3"])
 def test_each_wrong_answer_ends_under_its_name(web: FaultyWeb, scheme: str) -> None:
     assert READ_OF.keys() == WRONG_ANSWERS.keys()
-    store = opened(web, scheme)
+    soon, once = opened(web, scheme, SOON), opened(web, scheme)
     with ThreadPoolExecutor(len(READ_OF)) as threads:
-        found = threads.map(lambda fault: outcome(lambda: bytes(store.get(fault, 99))), READ_OF)
+        found = threads.map(
+            lambda fault: outcome(lambda: bytes((soon if fault in ENDLESS else once).get(fault, 99))), READ_OF
+        )
         for fault, says in zip(READ_OF, found, strict=True):
             assert READ_OF[fault][scheme == "s3"] in says, (fault, says)
             assert "internal" not in says.lower()
@@ -115,7 +121,8 @@ def test_a_bucket_s_other_answers_have_their_names(web: FaultyWeb) -> None:
     for fault, says in (("page", PAGE), ("gzip", "no listing"), ("chunked cut", "its listing ended early")):
         assert says in outcome(lambda: list(store.list("versions/"))), fault
     for fault, says in (("page", "no ETag"), ("continue", "no answer in time"), ("drip error", SLOW)):
-        assert says in outcome(lambda: store.put("blobs/sha256/aa", b"1")), fault
+        one = opened(web, "s3", SOON if fault in ENDLESS else ONCE)
+        assert says in outcome(partial(one.put, "blobs/sha256/aa", b"1")), fault
     for fault, hint in (
         ("503", "try again later"),
         ("404", "is the address that of a store"),
@@ -138,7 +145,34 @@ ODD_ANSWERS = {
 
 
 def test_an_error_that_drips_ends_as_soon_for_a_large_object(web: FaultyWeb) -> None:
-    assert f"{SLOW} 2 s" in outcome(partial(opened(web, "s3").get, "drip error", 1 << 30))
+    assert f"{SLOW} 2 s" in outcome(partial(opened(web, "s3", SOON).get, "drip error", 1 << 30))
+
+
+@pytest.mark.parametrize("ask", ["get", "put", "list"])
+def test_an_error_without_end_is_not_read_into_memory(
+    web: FaultyWeb, monkeypatch: pytest.MonkeyPatch, ask: str
+) -> None:
+    asks: dict[str, Callable[[Store], object]] = {
+        "get": lambda store: store.get("CURRENT", 99),
+        "put": lambda store: store.put("blobs/sha256/aa", b"1"),
+        "list": lambda store: list(store.list("versions/")),
+    }
+    sent: list[int] = []
+
+    def pieces(data: bytes) -> Iterator[bytes]:
+        for piece in endless_error(data):
+            sent.append(len(piece))
+            yield piece
+
+    monkeypatch.setitem(WRONG_ANSWERS, "endless error", pieces)
+    web.fault = lambda _path: "endless error"
+    assert "its answer, which is no object, has more than 64 MiB" in outcome(
+        lambda: asks[ask](opened(web, "s3", AGAIN))
+    )
+    assert sum(sent) > 64 << 20
+    assert "no permission" in outcome(lambda: opened(web, "http").get("CURRENT", 99))
+    web.fault = lambda _path: ""
+    assert bytes(opened(web, "s3", AGAIN).get("CURRENT", 99)) == TEXT
 
 
 def _only(answer: bytes, _data: bytes) -> list[bytes]:
@@ -149,16 +183,16 @@ def test_what_a_bucket_answers_is_no_silence(web: FaultyWeb, monkeypatch: pytest
     store = opened(web, "s3")
     for number, (odd, says) in enumerate(ODD_ANSWERS.items()):
         body = b"\xff" if says.endswith("UTF-8") else b"x"
-        answer = b"HTTP/1.1 %s\r\nContent-Length: 1\r\n\r\n%s" % (odd, body)
+        answer = b"HTTP/1.1 %s\r\nConnection: close\r\nContent-Length: 1\r\n\r\n%s" % (odd, body)
         monkeypatch.setitem(WRONG_ANSWERS, f"odd {number}", partial(_only, answer))
         assert says in outcome(partial(store.get, f"odd {number}", 99)), odd
 
 
 def test_an_upload_may_take_longer_than_silence(web: FaultyWeb) -> None:
-    store = opened(web, "s3")
+    store = opened(web, "s3", SOON)
 
     def take_in_slowly(_path: str) -> str:
-        time.sleep(2 * ONCE.read_s)
+        time.sleep(2 * SOON.read_s)
         return ""
 
     web.fault = take_in_slowly
@@ -200,6 +234,23 @@ def test_redirects_to_other_servers_are_refused(
         assert "refused, it is somewhere else" in outcome(ask)
     assert other.requests() == []
     assert not other.connections
+
+
+@pytest.mark.parametrize("ask", ["get", "head", "list"])
+def test_credentials_stay_at_the_port_of_the_store(web: FaultyWeb, other: FaultyWeb, ask: str) -> None:
+    """Redirects of a bucket to another port of its host are followed: obstore cannot refuse them."""
+    asks: dict[str, Callable[[Store], object]] = {
+        "get": lambda store: bytes(store.get("CURRENT", 99)),
+        "head": lambda store: store.head("CURRENT"),
+        "list": lambda store: list(store.list("versions/")),
+    }
+    web.fault = lambda _path: f"redirect {other.url}"
+    outcome(lambda: asks[ask](opened(web, "s3")))
+    assert "authorization" in web.last_headers
+    assert other.requests()
+    assert "authorization" not in other.last_headers
+    assert "refused, it is somewhere else" in outcome(lambda: opened(web, "s3").put("CURRENT", b"1"))
+    assert len(other.requests()) == 0
 
 
 def test_redirects_within_a_web_server_are_followed_to_their_end(web: FaultyWeb) -> None:
@@ -292,3 +343,16 @@ def test_a_panic_is_the_failure_of_its_request(web: FaultyWeb) -> None:
     thread.join()
     assert "the request has made the package obstore fail" in found[0]
     assert "the request has made the package obstore fail" in outcome(lambda: store.get("CURRENT", 99))
+
+
+@pytest.mark.parametrize("scheme", ["s3", "http"])
+def test_bytes_are_reported_as_they_come_and_to_whom_asked_for_them(web: FaultyWeb, scheme: str) -> None:
+    web.heal()
+    store, mine, others = opened(web, scheme), list[int](), list[int]()
+    with reporting_bytes(others.append), ThreadPoolExecutor(1) as pool:
+        pool.submit(store.get, "CURRENT", 1000).result()  # in a thread that reports nothing
+        with reporting_bytes(mine.append):
+            assert bytes(store.get("CURRENT", 1000)) == TEXT
+    assert (sum(mine), others) == (len(TEXT), [])
+    store.get("CURRENT", 1000)
+    assert sum(mine) == len(TEXT)

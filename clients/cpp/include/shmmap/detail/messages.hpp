@@ -152,7 +152,7 @@ inline Cells read_cells(Reader& reader, Row& row) {
     Row one(reader);
     Failure failure;
     for (std::string* text : {&failure.id, &failure.layer, &failure.code, &failure.message}) *text = one.get().text();
-    if (one.next()) reader.skip(1);  // the holders of the memory
+    if (one.next()) reader.skip(failure.holders = reader.array());
     if (one.next() && !reader.nil()) {
       Row sides(reader);
       auto& box = failure.box.emplace();

@@ -21,17 +21,6 @@ from typing import Any, Final
 
 from shmmap_clients.ndt_scan_matcher.backends.backend import DeviceError, DeviceHung, DeviceOptions, NoDevice
 
-__all__ = [
-    "NO_DRIVER_HINT",
-    "TIMEOUT_S",
-    "Device",
-    "DeviceInfo",
-    "Waiting",
-    "choose_device",
-    "list_devices",
-    "vendors_with_nvidia",
-]
-
 _VARIABLE: Final = "SHMMAP_OPENCL_DEVICE"
 NO_DRIVER_HINT: Final = (
     "`apt install pocl-opencl-icd` brings one for processors, the vendor's package one for its GPU; in a"

@@ -24,8 +24,6 @@ from shmmap_clients.ndt_scan_matcher.backends.backend import DeviceMemory, Uploa
 from shmmap_clients.ndt_scan_matcher.backends.opencl.devices import Device, Waiting
 from shmmap_clients.ndt_scan_matcher.map.voxel_map import TABLE_COLUMNS, Covariance, VoxelCell, VoxelMap
 
-__all__ = ["MapBuffers", "MapInPlace", "PlacedMap", "in_large_pages"]
-
 _ALIGNMENT: Final = 64
 _LARGE_PAGE: Final = 2 << 20
 _SQUARE_SHIFT: Final = 3  # as in the kernel: 8 x 8 columns
@@ -148,7 +146,7 @@ class MapBuffers:
         self._map_bytes = map_bytes
         self._lock = threading.Lock()
         self._waiting = Waiting(device.info.name)
-        with device_errors(device.info.name, f"allocate twice {map_bytes / 1e6:.0f} MB for maps"):
+        with device_errors(device.info.name, f"allocate twice {map_bytes >> 20:,} MiB for maps"):
             flags = cl.mem_flags
             if device.is_processor:
                 # the device reads this process's memory, so this process chooses the page size
@@ -213,7 +211,7 @@ class MapBuffers:
                 fits = self._place(half, voxel_map, covariance)
         if not fits:
             raise DeviceMemory(
-                f"a map of {voxel_map.voxels} voxels takes more than the {self._map_bytes / 1e6:.0f} MB that"
+                f"a map of {voxel_map.voxels} voxels takes more than the {self._map_bytes >> 20:,} MiB that"
                 f" device {self._device.info.name!r} has for one",
                 hint="VoxelMap(max_bytes=...) or --max-map-bytes leave out what is too much",
             )

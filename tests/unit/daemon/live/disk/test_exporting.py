@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is exported are the voxels of the chunks' files, each at its place, whatever the format."""
+"""What is exported are the voxels of the saved chunks, each at its place, whatever the format."""
 
 from __future__ import annotations
 
 import re
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -14,14 +15,16 @@ from numpy.typing import NDArray
 from shmmap.chunks.occupancy import Occupancy, probability
 from shmmap.daemon.live.disk.exporting import ExportedVoxels, Format, Voxels, export
 from shmmap.daemon.live.disk.folder import Folder
+from shmmap.daemon.live.disk.map_files import MapFiles
 from shmmap.daemon.live.disk.map_record import MapSettings
 from shmmap.daemon.live.disk.stored_map import StoredMap, opened_folder_to_read
 from shmmap.dividing.frame import Translation
 from shmmap.errors import MapDataError
 from shmmap.formats.cloud import read_cloud
 from tests.support.divided_map import read_pcd
-from tests.support.live_drive import RESOLUTION, Voxel
+from tests.support.live_drive import RESOLUTION, SETTINGS, Voxel
 from tests.support.live_reference import contents, stored_drive
+from tests.support.stored_chunks import change_chunk, largest
 
 FORMATS: list[Format] = ["ply", "pcd", "map"]
 FAR = (52000.0, -41000.0, 0.0)
@@ -36,9 +39,9 @@ def exported(
     translate: Translation = "auto",
     force: bool = False,
 ) -> ExportedVoxels | None:
-    with opened_folder_to_read(str(directory)) as files:
+    with opened_folder_to_read(str(directory)) as files, StoredMap(files, str(directory)) as stored:
         return export(
-            StoredMap(files, str(directory)), place(directory, kind), kind, voxels=voxels,
+            stored, place(directory, kind), kind, voxels=voxels,
             translate=translate, force=force,
         )  # fmt: skip
 
@@ -147,22 +150,19 @@ def test_voxels_that_are_neither(directory: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", FORMATS)
-def test_a_damaged_file_ends_it(directory: Path, kind: Format) -> None:
+def test_a_damaged_chunk_ends_it(directory: Path, kind: Format) -> None:
     stored_drive(directory, 2)
-    path = sorted(directory.glob("*.chunk"))[-1]
-    whole = path.read_bytes()
-    for damaged in (whole[:-1], whole[:100]):
-        path.write_bytes(damaged)
-        with pytest.raises(MapDataError, match=path.name) as caught:
-            exported(directory, kind, "both")
-        assert "live fsck" in caught.value.hint
-        assert contents(directory.parent.parent).keys() == {
-            f"live/lidar/{name}" for name in contents(directory)
-        }
-    path.rename(f"{path}.damaged.1")
+    key = largest(directory)
+    change_chunk(directory, key, lambda data: data[:-1])
+    with pytest.raises(MapDataError, match=f"chunk {key.text}") as caught:
+        exported(directory, kind, "both")
+    assert "live fsck" in caught.value.hint
+    assert contents(directory.parent.parent).keys() == {f"live/lidar/{name}" for name in contents(directory)}
+    with closing(Folder(directory)) as folder, closing(MapFiles(folder, SETTINGS)) as files:
+        assert files.load(key) is None  # as a daemon that finds it
     made = exported(directory, kind, "both")
     assert made is not None
-    assert made.quarantined == [f"{path.name}.damaged.1"]
+    assert made.lost == [key.text]
 
 
 def test_one_chunk_at_a_time(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -179,9 +179,9 @@ def test_one_chunk_at_a_time(directory: Path, monkeypatch: pytest.MonkeyPatch) -
         nonlocal most
         gc.collect()
         most = max(most, sum(one() is not None for one in alive))
-        header, view = read(self, key)  # type: ignore[arg-type]
+        view = read(self, key)  # type: ignore[arg-type]
         alive.append(weakref.ref(view))
-        return header, view
+        return view
 
     monkeypatch.setattr(StoredMap, "chunk", counted)
     assert exported(directory, "ply", "both") is not None

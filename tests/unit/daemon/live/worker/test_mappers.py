@@ -4,23 +4,24 @@
 from __future__ import annotations
 
 import errno
+from pathlib import Path
 
 import pytest
 
 from shmmap.chunks.layout import MAPPERS
+from shmmap.daemon.live.disk.folder import Folder
 from shmmap.daemon.live.disk.map_files import SCANS_AHEAD, MapFiles
 from shmmap.daemon.live.disk.map_record import MapSettings
 from shmmap.daemon.live.worker.mappers import APPLIED_BYTES, AppliedScans, Mappers
 from shmmap.errors import BadRequest, Busy, LiveInterrupted
-from tests.support.disks import CutDisk
 from tests.support.odd_files import failing
 
 SETTINGS = MapSettings(resolution=0.1)
 
 
 @pytest.fixture
-def disk() -> CutDisk:
-    return CutDisk()
+def disk(tmp_path: Path) -> Folder:
+    return Folder(tmp_path / "map")
 
 
 @pytest.fixture
@@ -30,7 +31,7 @@ def memory() -> bytearray:
 
 
 @pytest.fixture
-def mappers(disk: CutDisk, memory: bytearray) -> Mappers:
+def mappers(disk: Folder, memory: bytearray) -> Mappers:
     return Mappers(MapFiles(disk, SETTINGS), AppliedScans(memory))
 
 
@@ -94,7 +95,7 @@ def test_where_all_are_in_use_another_is_refused(mappers: Mappers) -> None:
     assert opened[5].mapper.number not in mappers.by_number
 
 
-def test_the_next_run_knows_what_is_in_the_map(disk: CutDisk, memory: bytearray, mappers: Mappers) -> None:
+def test_the_next_run_knows_what_is_in_the_map(disk: Folder, memory: bytearray, mappers: Mappers) -> None:
     """Up to the last scan before which none is missing, in whatever order they were applied."""
     front, rear = mappers.open(1000, "front", 1), mappers.open(1000, "rear", 2)
     for scan in (1, 2, 3, 4):
@@ -109,11 +110,11 @@ def test_the_next_run_knows_what_is_in_the_map(disk: CutDisk, memory: bytearray,
     assert later.open(1000, "new", 3).applied == 0
 
 
-def test_without_memory_the_manifest_says_what_is_in_the_map(disk: CutDisk, mappers: Mappers) -> None:
+def test_without_memory_the_record_says_what_is_in_the_map(disk: Folder, mappers: Mappers) -> None:
     front = mappers.open(1000, "front", 1)
     files = MapFiles(disk, SETTINGS)
-    files.write_manifest({front.mapper.number: 7})
-    files.write_manifest(None)  # nothing new is known
+    files.write_record({front.mapper.number: 7})
+    files.write_record(None)  # nothing new is known
     assert MapFiles(disk, SETTINGS).applied == {front.mapper.number: 7}
     for record, applied in ((bytearray(APPLIED_BYTES), 7), (_noted(front.mapper.number, 12), 12)):
         later = Mappers(MapFiles(disk, SETTINGS), AppliedScans(record))
@@ -137,7 +138,7 @@ def test_rows_of_forgotten_mappers_are_used_again() -> None:
     assert (record.of(100), record.of(5), record.of(6)) == (7, 0, 60)
 
 
-def test_the_next_run_gives_numbers_that_no_scan_had(disk: CutDisk, mappers: Mappers) -> None:
+def test_the_next_run_gives_numbers_that_no_scan_had(disk: Folder, mappers: Mappers) -> None:
     """Also when one of a previous run comes again first: of those after it nothing is known."""
     front = mappers.open(1000, "front", 1)
     for scan in range(1, 8):
@@ -154,12 +155,12 @@ def test_the_next_run_gives_numbers_that_no_scan_had(disk: CutDisk, mappers: Map
 
 
 def test_a_mapper_goes_on_while_the_disk_is_full(
-    monkeypatch: pytest.MonkeyPatch, disk: CutDisk, mappers: Mappers
+    monkeypatch: pytest.MonkeyPatch, disk: Folder, mappers: Mappers
 ) -> None:
     active = mappers.open(1000, "front", 1)
     number = active.mapper.number
     with monkeypatch.context() as patch:
-        patch.setattr(CutDisk, "write", failing(errno.ENOSPC))
+        patch.setattr(Folder, "write", failing(errno.ENOSPC))
         for scan in range(1, 3000):
             mappers.expect(number, scan, 1)
         for _ in range(2):
@@ -176,12 +177,12 @@ def test_a_mapper_goes_on_while_the_disk_is_full(
 
 
 def test_a_mapper_that_cannot_be_forgotten_stays(
-    monkeypatch: pytest.MonkeyPatch, disk: CutDisk, mappers: Mappers
+    monkeypatch: pytest.MonkeyPatch, disk: Folder, mappers: Mappers
 ) -> None:
     for number in range(MAPPERS):
         mappers.open(1000, f"m{number}", 0)
     with monkeypatch.context() as patch:
-        patch.setattr(CutDisk, "write", failing(errno.EIO))
+        patch.setattr(Folder, "write", failing(errno.EIO))
         for _ in range(2):
             with pytest.raises(OSError, match="Input/output"):
                 mappers.open(1000, "new", 1)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import stat
 import tempfile
@@ -29,6 +30,7 @@ def path() -> Iterator[Path]:
 
 @pytest.fixture
 def marks(path: Path) -> Iterator[MarksDirectory]:
+    gc.collect()  # else what earlier tests left may be closed meanwhile
     before = len(os.listdir("/proc/self/fd"))
     one = MarksDirectory(str(path))
     yield one

@@ -33,6 +33,7 @@ from tests.support.daemon_process import Deadline
 from tests.support.live_drive import RESOLUTION, Voxel, marked
 from tests.support.odd_files import failing
 from tests.support.served_map import Served
+from tests.support.stored_chunks import change_chunk, database, saved_bytes
 
 Serve = Callable[..., Served]
 NOTHING = Marks(
@@ -225,8 +226,8 @@ def test_unexpected_marks_end_nothing(serve: Serve, monkeypatch: pytest.MonkeyPa
     assert one.answer(one.send(marks, mapper, 1)).scan == 1
 
 
-def test_a_chunk_whose_file_is_damaged_is_not_written_over(serve: Serve, tmp_path: Path) -> None:
-    """Nothing is known of it from now on; the file stays, under another name."""
+def test_a_chunk_that_is_damaged_is_not_written_over(serve: Serve, tmp_path: Path) -> None:
+    """Nothing is known of it from now on; its row stays, beside another."""
     (marks,) = marked(1)
 
     def map_it() -> None:
@@ -236,13 +237,12 @@ def test_a_chunk_whose_file_is_damaged_is_not_written_over(serve: Serve, tmp_pat
         one.end()
 
     map_it()
-    victim = tmp_path / "map" / f"{marks.chunks[0].text}.chunk"
-    damaged = bytearray(victim.read_bytes())
-    damaged[-1] ^= 1
-    victim.write_bytes(damaged)
+    change_chunk(tmp_path / "map", marks.chunks[0], lambda data: data[:-1] + bytes([data[-1] ^ 1]))
+    damaged = saved_bytes(tmp_path / "map", marks.chunks[0])
     map_it()
-    assert victim.read_bytes() != damaged
-    assert damaged in [path.read_bytes() for path in victim.parent.iterdir() if path.is_file()]
+    assert saved_bytes(tmp_path / "map", marks.chunks[0]) != damaged
+    with database(tmp_path / "map") as opened:
+        assert (damaged,) in opened.execute("select data from chunks").fetchall()
 
 
 def test_what_was_all_but_given_up_comes_back_from_disk(
@@ -423,19 +423,19 @@ def test_a_directory_that_cannot_be_flushed_is_tried_again_later(
     assert one.map.status().problem == ""
 
 
-def test_the_list_of_files_is_written_once_a_minute(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_record_is_written_once_a_minute(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
     """However often chunks change."""
     one = serve(**LATER)
     mapper = one.open().mapper
     times_s: list[float] = []
-    monkeypatch.setattr(one.live, "list_files", lambda _: times_s.append(one.now_s))
+    monkeypatch.setattr(one.live, "write_record", lambda _: times_s.append(one.now_s))
     scans = marked(10)
     for number, marks in enumerate(scans, 1):
         one.answer(one.send(marks, mapper, number))
         one.now_s += 20.0
         one.turn()
     assert len(times_s) > 1
-    assert min(b - a for a, b in pairwise(times_s)) >= served_map.MANIFEST_S
+    assert min(b - a for a, b in pairwise(times_s)) >= served_map.RECORD_S
 
 
 # --- sleeping -----------------------------------------------------------------------------------
