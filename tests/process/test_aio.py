@@ -203,10 +203,13 @@ def test_a_late_answer_does_not_keep_the_loop_busy(one: DaemonProcess, run: Call
 
     async def main(client: shmmap.aio.Client) -> None:
         loop: Any = asyncio.get_running_loop()
-        for _ in range(20):
-            task = asyncio.create_task(client.around(0, 0, 5))
-            await until(lambda: table_of(client).entries)
+        one.send(signal.SIGSTOP)  # else one may be answered before it is cancelled
+        tasks = [asyncio.create_task(client.around(0, 0, 5)) for _ in range(20)]
+        await until(lambda: len(table_of(client).entries) == 20)
+        for task in tasks:
             task.cancel()
+        await asyncio.wait(tasks)
+        one.send(signal.SIGCONT)
         await client.stats()  # its answer comes after theirs
         waits: list[float | None] = []
         select = loop._selector.select

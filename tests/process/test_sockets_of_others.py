@@ -39,6 +39,20 @@ def test_another_program_listens_there(
     assert Shmmap(one, tmp_path)("health").startswith("healthy")
 
 
+def test_another_program_is_about_to_listen_there(served: DaemonProcess) -> None:
+    """What is bound there is not taken for a leftover; what its program leaves is."""
+    with socket.socket(socket.AF_UNIX) as other:
+        os.unlink(served.endpoint)
+        other.bind(served.endpoint)
+        before = os.stat(served.endpoint).st_ino
+        until(lambda: counters(served)["sockets_missing"] == 1, lambda: served.log)
+        assert f"in use by pid {os.getpid()} (" in served.log
+        assert os.stat(served.endpoint).st_ino == before
+    until(lambda: counters(served)["sockets_missing"] == 0, lambda: served.log)
+    with connect(served.endpoint) as client:
+        assert len(client.selected(["0_0.pcd"], wait=30.0)) == 1
+
+
 @pytest.mark.parametrize("stops", [1, 2])
 def test_what_another_program_puts_there_stays_at_the_end(
     served: DaemonProcess, tmp_path: Path, stops: int

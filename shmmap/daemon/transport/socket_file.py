@@ -130,8 +130,10 @@ def _answers(path: str) -> int | None:
                 credentials = probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
                 pid = _CREDENTIALS.unpack(credentials)[0]
                 return pid if pid > 0 and os.path.exists(f"/proc/{pid}") else _owner(path)
-            except (ConnectionRefusedError, FileNotFoundError):
+            except FileNotFoundError:
                 return None
+            except ConnectionRefusedError:  # a leftover, unless somebody has bound it and is about to listen
+                return _owner(path) or None
             except OSError as error:
                 if error.errno != errno.EPROTOTYPE:  # EPROTOTYPE: another type of socket
                     return _owner(path)
@@ -139,7 +141,7 @@ def _answers(path: str) -> int | None:
 
 
 def _owner(path: str) -> int:
-    """Return the process that has an open socket with this path; 0 if the kernel does not show it."""
+    """Return the other process that has an open socket with this path; 0 if the kernel does not show it."""
     inodes = set()
     with contextlib.suppress(OSError), open("/proc/net/unix", errors="surrogateescape") as table:
         for line in table:
@@ -147,6 +149,8 @@ def _owner(path: str) -> int:
             if len(row) == 8 and row[7] == path:
                 inodes.add(f"socket:[{row[6]}]")
     for process in Path("/proc").glob("[0-9]*") if inodes else ():
+        if process.name == str(os.getpid()):  # where this daemon listens at a file that was removed
+            continue
         with contextlib.suppress(OSError):
             if any(os.readlink(fd) in inodes for fd in process.joinpath("fd").iterdir()):
                 return int(process.name)

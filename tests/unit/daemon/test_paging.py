@@ -291,7 +291,7 @@ def test_along_a_drive_a_waiting_request_has_all_that_can_be_reached(
         changes = layer == "points" and chance.random() < 0.15
         while not one.daemon.answered():
             one.daemon.turn()
-            one.let_come(chance, failing=0.15)
+            one.let_come(chance, failing=0.7)
             if changes and len(one.daemon.service._loop.cells):
                 changes = False
                 one.directory.change(chance.choice(ALL), step)
