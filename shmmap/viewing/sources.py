@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from shmmap.client.cell import Cell
     from shmmap.client.client import Client
     from shmmap.client.map_listing import MapListing
-    from shmmap.daemon.live.disk.stored_map import StoredMap
     from shmmap.errors import CellError
+    from shmmap.live_worker.disk.stored_map import StoredMap
     from shmmap.origin.remote.map_versions import Current
     from shmmap.origin.remote.store import Store
 
@@ -355,10 +355,10 @@ def open_files(paths: Sequence[str]) -> Iterator[PointSource]:
     MapDataError
         A file is damaged, or of an unknown format.
     """
-    from shmmap.daemon.live.disk.map_record import MAP_FILE
-    from shmmap.daemon.live.disk.schema import DATABASE
-    from shmmap.daemon.live.disk.stored_map import StoredMap, opened_folder_to_read
     from shmmap.dividing.inputs import find_inputs
+    from shmmap.live_worker.disk.map_record import MAP_FILE
+    from shmmap.live_worker.disk.schema import DATABASE
+    from shmmap.live_worker.disk.stored_map import StoredMap, opened_folder_to_read
     from shmmap.origin.map_directory import open_map
 
     first = paths[0]

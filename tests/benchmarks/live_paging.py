@@ -32,11 +32,11 @@ import shmmap
 from shmmap.chunks.chunk_file import encode_chunk
 from shmmap.chunks.layout import ChunkView, new_header
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.chunk_memory import memory_bytes
-from shmmap.daemon.live.disk.folder import Folder
-from shmmap.daemon.live.disk.map_files import MapFiles
-from shmmap.daemon.live.disk.map_record import MapSettings
 from shmmap.formats.durable_file import flush_directory
+from shmmap.live_worker.chunk_memory import memory_bytes
+from shmmap.live_worker.disk.folder import Folder
+from shmmap.live_worker.disk.map_files import MapFiles
+from shmmap.live_worker.disk.map_record import MapSettings
 from tests.support.live_bench import (
     FILTER,
     MAP,

@@ -380,8 +380,8 @@ def reading_disk(orders: Orders, endpoint: str, readers: int) -> int:
 
 SLOW_DISK = """
 import os, sys, time
-if any("live.worker" in word for word in sys.orig_argv):
-    from shmmap.daemon.live.disk import map_files
+if any("live_worker" in word for word in sys.orig_argv):
+    from shmmap.live_worker.disk import map_files
     load = map_files.MapFiles.load
     def slow(self, key, generation=0):
         if os.path.exists(__file__ + ".slow"):

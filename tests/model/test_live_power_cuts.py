@@ -17,9 +17,9 @@ import pytest
 from shmmap.chunks.chunk_file import encode_chunk
 from shmmap.chunks.layout import ChunkView, new_header
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.disk.folder import Folder
-from shmmap.daemon.live.disk.map_files import MapFiles
-from shmmap.daemon.live.disk.map_record import MapSettings
+from shmmap.live_worker.disk.folder import Folder
+from shmmap.live_worker.disk.map_files import MapFiles
+from shmmap.live_worker.disk.map_record import MapSettings
 
 SETTINGS = MapSettings(resolution=0.1)
 PAGE = 4096

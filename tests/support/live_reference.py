@@ -17,9 +17,9 @@ from shmmap.chunks.chunk_file import encode_chunk, read_file_header
 from shmmap.chunks.marking import Marker
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.client.live.live_map import ChunkInfo, LiveMap
-from shmmap.daemon.live.disk.folder import Folder
-from shmmap.daemon.live.disk.map_files import MapFiles
-from shmmap.daemon.live.disk.map_record import MapSettings, Row
+from shmmap.live_worker.disk.folder import Folder
+from shmmap.live_worker.disk.map_files import MapFiles
+from shmmap.live_worker.disk.map_record import MapSettings, Row
 from tests.support.chunk_memory import ChunkMemory
 from tests.support.daemon_process import DaemonProcess
 from tests.support.live_drive import FILTER, RESOLUTION, SETTINGS, SlowOccupancy, Voxel, drive
@@ -140,5 +140,5 @@ LiveDaemon = Callable[..., DaemonProcess]
 
 def worker_of(one: DaemonProcess) -> int:
     """Id of the live worker."""
-    (found,) = (pid for pid in one.children() if b"live.worker" in Path(f"/proc/{pid}/cmdline").read_bytes())
+    (found,) = (pid for pid in one.children() if b"live_worker" in Path(f"/proc/{pid}/cmdline").read_bytes())
     return found

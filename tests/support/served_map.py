@@ -10,14 +10,14 @@ from typing import Any
 
 from shmmap.chunks.marks import Marks, encode_marks
 from shmmap.chunks.voxels import voxels_of
-from shmmap.daemon.config_live import LiveSettings
-from shmmap.daemon.live.chunk_memory import ChunkMemory, live_prefix
-from shmmap.daemon.live.disk.folder import Folder
-from shmmap.daemon.live.disk.map_files import MapFiles
-from shmmap.daemon.live.messages import Ask
-from shmmap.daemon.live.paging.residency import Limits
-from shmmap.daemon.live.worker.marks_directory import MarksDirectory
-from shmmap.daemon.live.worker.served_map import ServedMap
+from shmmap.live_messages import Ask
+from shmmap.live_settings import LiveSettings
+from shmmap.live_worker.chunk_memory import ChunkMemory, live_prefix
+from shmmap.live_worker.disk.folder import Folder
+from shmmap.live_worker.disk.map_files import MapFiles
+from shmmap.live_worker.marks_directory import MarksDirectory
+from shmmap.live_worker.paging.residency import Limits
+from shmmap.live_worker.served_map import ServedMap
 from shmmap.protocol import live as messages
 from tests.support.daemon_process import Deadline
 from tests.support.live_drive import RESOLUTION, SETTINGS, Voxel

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.disk.folder import Folder
-from shmmap.daemon.live.disk.map_files import MapFiles
+from shmmap.live_worker.disk.folder import Folder
+from shmmap.live_worker.disk.map_files import MapFiles
 from tests.support.divided_map import read_pcd
 from tests.support.live_drive import SETTINGS
 from tests.support.live_reference import contents, old_directory, stored_drive
