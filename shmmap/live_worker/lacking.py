@@ -15,11 +15,11 @@ from shmmap.protocol.live import MAX_LACKING, LackingChunk
 _KEYS_PER_STEP: Final = 64
 
 
-def lacking_chunks(live: PagedMap, area: LiveArea | None) -> Generator[None, None, dict[ChunkKey, str]]:
+def lacking_chunks(paged: PagedMap, area: LiveArea | None) -> Generator[None, None, dict[ChunkKey, str]]:
     """Return the chunks that touch an area and have lost something, and what; yield after each step."""
     found: dict[ChunkKey, str] = {}
-    for number, (key, one) in enumerate(dict(live.files.lost).items(), 1):
-        if touches(area, key, live.resolution):
+    for number, (key, one) in enumerate(dict(paged.database.lost).items(), 1):
+        if touches(area, key, paged.resolution):
             found[key] = one.text
         if number % _KEYS_PER_STEP == 0:
             yield None

@@ -23,7 +23,7 @@ from shmmap.errors import BadRequest, ConfigError, InstanceBusy, InternalError, 
 from shmmap.live_settings import LiveSettings
 from shmmap.live_worker.chunk_memory import ChunkMemory, live_prefix
 from shmmap.live_worker.disk.folder import Folder
-from shmmap.live_worker.disk.map_files import MapFiles
+from shmmap.live_worker.disk.map_database import MapDatabase
 from shmmap.live_worker.marks_directory import MarksDirectory
 from shmmap.live_worker.opening import OpeningMap
 from shmmap.live_worker.paging.residency import Limits
@@ -83,7 +83,7 @@ class _Worker:
         if not self._begun and all(one.problem for one in self._opening.values()):
             self._begun = True
             self._send_status(now_s)  # before READY, so that the maps' state is available by then
-            chunks = sum(len(one.live.chunks) for one in self._maps.values())
+            chunks = sum(len(one.paged.chunks) for one in self._maps.values())
             self._send(messages.Begun(len(self._maps), chunks, *self._refusal()))
 
     def _refusal(self) -> tuple[str, str, str]:
@@ -94,22 +94,22 @@ class _Worker:
             return "", "", ""
         return refused[0].code, refused[0].message, refused[0].hint
 
-    def _served(self, settings: LiveSettings, folder: Folder, files: MapFiles) -> ServedMap:
+    def _served(self, settings: LiveSettings, folder: Folder, database: MapDatabase) -> ServedMap:
         """Set up a map in memory, including chunks that a previous process left there."""
         wanted = self._wanted
         prefix = live_prefix(wanted.instance, settings.name)
         limits = _limits(settings, self._budget_bytes, len(wanted.maps))
         with contextlib.ExitStack() as closing:
             closing.callback(folder.close)
-            closing.callback(files.close, END_S)
+            closing.callback(database.close, END_S)
             if self._marks is None:
                 self._marks = MarksDirectory(wanted.marks_dir, wanted.marks_gid)
             memory = ChunkMemory(wanted.shm_dir, prefix, wanted.gid)
             closing.callback(memory.close)
             served = ServedMap(
-                settings, files, memory, limits, self._marks, self._answer, self._wake, usual_codec()
+                settings, database, memory, limits, self._marks, self._answer, self._wake, usual_codec()
             )
-            closing.callback(served.live.close)
+            closing.callback(served.paged.close)
             adopted = served.adopt(time.monotonic())
             self._closing[settings.name] = closing.pop_all()
         log.info(
@@ -117,9 +117,9 @@ class _Worker:
             map=settings.name,
             path=settings.path,
             chunks=adopted,
-            files=len(files.rows),
-            damaged=len(files.damaged),
-            lost=len(files.lost),
+            files=len(database.rows),
+            damaged=len(database.damaged),
+            lost=len(database.lost),
         )
         return served
 
@@ -241,14 +241,14 @@ class _Worker:
     def _may_end(self, ending: messages.End, now_s: float) -> bool:
         """Return whether all is saved, or saving has made no progress for a while."""
         left = [one for one in self._maps.values() if not one.is_saved]
-        return ending.keep or all(now_s > max(one.live.saved_s, self._ending_s) + HOPELESS_S for one in left)
+        return ending.keep or all(now_s > max(one.paged.saved_s, self._ending_s) + HOPELESS_S for one in left)
 
     def end(self, ending: messages.End) -> tuple[messages.Unsaved, ...]:
         """Close all maps, keeping or freeing their memory; return the unsaved chunks, which stay."""
         unsaved = []
         for name, one in self._maps.items():
             if chunks := one.end(keep=ending.keep):
-                unsaved.append(messages.Unsaved(name, chunks, one.live.problem))
+                unsaved.append(messages.Unsaved(name, chunks, one.paged.problem))
         if self._marks is not None:
             self._marks.close()
         for closing in self._closing.values():

@@ -18,7 +18,7 @@ import numpy as np
 
 from shmmap.chunks.layout import MAPPERS
 from shmmap.errors import BadRequest, Busy, LiveInterrupted
-from shmmap.live_worker.disk.map_files import MapFiles
+from shmmap.live_worker.disk.map_database import MapDatabase
 from shmmap.live_worker.disk.map_record import Mapper
 
 MAX_SCANS: Final = 1 << 61
@@ -101,14 +101,14 @@ class ActiveMapper:
 class Mappers:
     """All mappers of one map."""
 
-    def __init__(self, files: MapFiles, record: AppliedScans) -> None:
-        self._files = files
+    def __init__(self, database: MapDatabase, record: AppliedScans) -> None:
+        self._database = database
         self._record = record
         self._uses = 0
         self._opening = threading.Lock()
         self.by_number: dict[int, ActiveMapper] = {}
-        for one in files.mappers:
-            last = max(record.of(one.number), files.applied.get(one.number, 0))
+        for one in database.mappers:
+            last = max(record.of(one.number), database.applied.get(one.number, 0))
             self.by_number[one.number] = ActiveMapper(one, one.scans + 1, last=last)
 
     def open(self, uid: int, name: str, session: int) -> ActiveMapper:
@@ -128,11 +128,11 @@ class Mappers:
             else:
                 if len(self.by_number) >= MAPPERS:
                     self._forget_one()
-                mapper = self._files.add_mapper(uid, name)
+                mapper = self._database.add_mapper(uid, name)
                 active = ActiveMapper(mapper)
                 self.by_number = {**self.by_number, mapper.number: active}  # another thread may iterate
             # now, not with the first scan: once opened, a mapper works even when the disk is full
-            self._files.expect_scan(active.mapper, self.next_scan(active))
+            self._database.expect_scan(active.mapper, self.next_scan(active))
             active.session = session
             self._uses += 1
             active.used = self._uses
@@ -146,7 +146,7 @@ class Mappers:
                 hint="end one of them, or let two programs' scans come through one",
             )
         oldest = min(idle, key=lambda one: one.used)
-        self._files.forget_mapper(oldest.mapper)
+        self._database.forget_mapper(oldest.mapper)
         self.by_number = {number: one for number, one in self.by_number.items() if one is not oldest}
 
     def accepted(self, active: ActiveMapper, scan: int) -> None:
@@ -197,7 +197,7 @@ class Mappers:
             raise BadRequest(f"scan {scan}: numbers begin at 1 and rise")
         if scan >= active.mapper.scans:
             with self._opening:
-                self._files.expect_scan(active.mapper, scan)
+                self._database.expect_scan(active.mapper, scan)
         return active
 
     def on_disconnect(self, session: int) -> None:

@@ -15,7 +15,7 @@ from shmmap.errors import ShmmapError
 from shmmap.live_messages import not_served
 from shmmap.live_settings import LiveSettings
 from shmmap.live_worker.disk.folder import Folder
-from shmmap.live_worker.disk.map_files import MapFiles
+from shmmap.live_worker.disk.map_database import MapDatabase
 from shmmap.live_worker.disk.map_record import MapSettings
 from shmmap.logfmt import log
 from shmmap.protocol.live import LiveMapRow
@@ -52,10 +52,10 @@ class OpeningMap:
         self._wake = wake
         self._begun_s = self._retry_s = 0.0
         self._thread: threading.Thread | None = None
-        self._outcome: list[tuple[Folder, MapFiles] | Exception] = []
+        self._outcome: list[tuple[Folder, MapDatabase] | Exception] = []
 
-    def run_turn(self, now_s: float) -> tuple[Folder, MapFiles] | None:
-        """Continue; once the files are read, begin a new run and return the open directory and the files."""
+    def run_turn(self, now_s: float) -> tuple[Folder, MapDatabase] | None:
+        """Continue; once the files are read, begin a new run and return the directory and the database."""
         if self._thread is None:
             if now_s >= self._retry_s:
                 self._begun_s = now_s
@@ -97,7 +97,7 @@ class OpeningMap:
 
     def _read(self) -> None:
         """Read the files, in a thread that may never return."""
-        outcome: tuple[Folder, MapFiles] | Exception
+        outcome: tuple[Folder, MapDatabase] | Exception
         try:
             outcome = _open_files(self.settings)
         except Exception as error:  # noqa: BLE001  a damaged file must not end other maps
@@ -106,16 +106,17 @@ class OpeningMap:
         self._wake()
 
 
-def _open_files(settings: LiveSettings) -> tuple[Folder, MapFiles]:
+def _open_files(settings: LiveSettings) -> tuple[Folder, MapDatabase]:
     """Open a map's directory and read it; a new run of the map begins."""
     with contextlib.ExitStack() as undo:
         folder = Folder(settings.path)
         undo.callback(folder.close)
-        files = MapFiles(folder, MapSettings(settings.resolution, settings.occupancy, settings.frame_id))
-        undo.callback(files.close)
-        files.begin_run()
+        fixed = MapSettings(settings.resolution, settings.occupancy, settings.frame_id)
+        database = MapDatabase(folder, fixed)
+        undo.callback(database.close)
+        database.begin_run()
         undo.pop_all()
-    return folder, files
+    return folder, database
 
 
 def _reason(error: Exception) -> str:

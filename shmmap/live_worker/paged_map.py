@@ -30,7 +30,7 @@ from shmmap.chunks.marks import Marks
 from shmmap.chunks.voxels import CHUNK_SIDE, ChunkKey
 from shmmap.errors import CannotStart, PackageMissing, SegmentCorrupt
 from shmmap.live_worker.chunk_memory import ChunkFile, ChunkMemory, memory_bytes
-from shmmap.live_worker.disk.map_files import MapFiles
+from shmmap.live_worker.disk.map_database import MapDatabase
 from shmmap.live_worker.paging.durability import Chunk, Scan
 from shmmap.live_worker.paging.key_index import KeyIndex
 from shmmap.live_worker.paging.residency import RETRY_S, Limits, Residency
@@ -150,11 +150,11 @@ class _Part(NamedTuple):
 
 
 class PagedMap:
-    """A map, its memory and its files.
+    """A map, its memory and its database.
 
     Parameters
     ----------
-    files, memory
+    database, memory
         The map on disk and in shared memory.
     limits
         Limits of the map's memory and files.
@@ -177,41 +177,41 @@ class PagedMap:
 
     def __init__(
         self,
-        files: MapFiles,
+        database: MapDatabase,
         memory: ChunkMemory,
         limits: Limits,
         observer: Observer,
         wake: Callable[[], None] = lambda: None,
         codec: str = "zlib",
     ) -> None:
-        self.files = files
+        self.database = database
         self.memory = memory
         self.limits = limits
         self.residency = Residency(limits, new_bytes=memory_bytes(0))
         self.chunks: dict[ChunkKey, ChunkFile] = {}
-        self.stored = KeyIndex(files.rows)
+        self.stored = KeyIndex(database.rows)
         self.problems: dict[str, str] = {}
         self.saved_s = -math.inf
         self._observer = observer
         self._codec = codec
         self._undo = UndoRecord(memory.record("undo", UNDO_BYTES))
-        self._writer = ChunkWriter(files.settings.occupancy, self._undo)
+        self._writer = ChunkWriter(database.settings.occupancy, self._undo)
         self._threads = FileThreads(wake)
         self._parts: dict[Scan, _Part] = {}
-        self._generation = files.begin_run() << 32
+        self._generation = database.begin_run() << 32
         self._look_s = 0.0
         self._end_s: float | None = None
-        for key, row in files.rows.items():
+        for key, row in database.rows.items():
             self.residency.note_size(key, memory_bytes(row.bricks))
 
     @property
     def resolution(self) -> float:
         """Edge of a voxel, metres."""
-        return self.files.settings.resolution
+        return self.database.settings.resolution
 
     def identity(self, key: ChunkKey, generation: int) -> ChunkIdentity:
         """Return the identity of a chunk of this map."""
-        return self.files.settings.identity(self.files.map_id, key, generation)
+        return self.database.settings.identity(self.database.map_id, key, generation)
 
     # --- chunks of a previous writer ------------------------------------------------------------
 
@@ -244,7 +244,7 @@ class PagedMap:
                 if undone == (key, generation):
                     self._undo.restore(chunk.view)
                 check_consistent(chunk.view, name)
-                if int(chunk.view.state["version"]) < self.files.version(key):
+                if int(chunk.view.state["version"]) < self.database.version(key):
                     raise SegmentCorrupt(f"{name}: older than its file")
             except SegmentCorrupt as error:
                 log.warning("chunk not adopted", chunk=key.text, reason=error.message)
@@ -283,9 +283,9 @@ class PagedMap:
         """Add a complete chunk that is in memory already."""
         key, state = chunk.view.identity.key, chunk.view.state
         self.chunks[key] = chunk
-        self.files.note_whole(key, int(state["version"]))
+        self.database.note_whole(key, int(state["version"]))
         # its previous writer may have died before it recorded that
-        saved = state["saved_version"] = self.files.version(key)
+        saved = state["saved_version"] = self.database.version(key)
         version, active = int(state["version"]), int(state["active"])
         self.residency.adopt(
             key, version=version, saved=saved, nbytes=chunk.nbytes, active=active, now_s=now_s
@@ -334,8 +334,8 @@ class PagedMap:
         """Do what can be done now, without waiting for the disk."""
         self._threads.deliver(now_s)
         self._check_directory(now_s, save_all=save_all)
-        while self.files.found_lost:
-            self.note_lost(self.files.found_lost.popleft(), now_s)
+        while self.database.found_lost:
+            self.note_lost(self.database.found_lost.popleft(), now_s)
         residency = self.residency
         for chunk, scan in residency.ready()[:CHUNKS_PER_TURN]:
             self._apply(chunk, scan, now_s, now_ns)
@@ -357,7 +357,7 @@ class PagedMap:
         self._threads.start(jobs)
         if residency.flush_is_due(now_s, everything=save_all):
             residency.durability.begin()
-            self._threads.start([Job(self.files.flush, self._flushed)])
+            self._threads.start([Job(self.database.flush, self._flushed)])
 
     def _check_directory(self, now_s: float, *, save_all: bool) -> None:
         hangs = self._threads.idle_s(now_s) > HANGS_S
@@ -367,8 +367,8 @@ class PagedMap:
             self._threads.start([Job(self._look, self._checked)])
 
     def _look(self) -> str:
-        self.files.look_again()
-        return self.files.files.moved()
+        self.database.look_again()
+        return self.database.folder.moved()
 
     def _checked(self, future: Future[str], now_s: float) -> None:
         self._look_s = now_s + LOOK_S
@@ -403,7 +403,7 @@ class PagedMap:
         more = memory_bytes(bricks) - chunk.nbytes
         if more > 0 and not self.residency.may_grow(chunk, more):
             return
-        known = {mapper.number for mapper in self.files.mappers}
+        known = {mapper.number for mapper in self.database.mappers}
         try:
             self._writer.apply(
                 file.view,
@@ -437,9 +437,9 @@ class PagedMap:
 
     def _load(self, identity: ChunkIdentity) -> ChunkFile:
         """Load a chunk from its file, or create it if there is no good one."""
-        content = self.files.load(identity.key, identity.generation)
+        content = self.database.load(identity.key, identity.generation)
         if content is None:
-            self.files.note_remade(identity.key)
+            self.database.note_remade(identity.key)
             content = new_header(identity)
         return self.memory.create(content)
 
@@ -451,7 +451,7 @@ class PagedMap:
             self.residency.load_failed(chunk, now_s)
             return
         self._succeeded("loaded")
-        if chunk.key not in self.files.rows:
+        if chunk.key not in self.database.rows:
             self.stored.discard(chunk.key)
         self.chunks[chunk.key] = file
         version, active = int(file.view.state["version"]), int(file.view.state["active"])
@@ -460,16 +460,16 @@ class PagedMap:
 
     def note_lost(self, key: ChunkKey, now_s: float) -> None:
         """Note that a chunk has no good file any more; save it again if memory has all of it."""
-        if key in self.files.rows:
+        if key in self.database.rows:
             return  # saved meanwhile
         self.stored.discard(key)
         chunk = self.residency.chunks.get(key)
         if key in self.chunks and chunk is not None and chunk.saved:  # else it was made new meanwhile
-            self.files.note_whole(key, chunk.version)
+            self.database.note_whole(key, chunk.version)
             self.residency.save_again(chunk, now_s)
 
     def _save(self, key: ChunkKey, view: ChunkView) -> None:
-        self.files.save(key, encode_chunk(view, self._codec))
+        self.database.save(key, encode_chunk(view, self._codec))
 
     def _saved(self, chunk: Chunk, version: int, future: Future[None], now_s: float) -> None:
         try:
@@ -488,7 +488,7 @@ class PagedMap:
     def problem(self) -> str:
         """The problem that keeps chunks from being loaded or saved at present; empty if there is none."""
         problems = list(self.problems.values())
-        if (unreadable := dict(self.files.unreadable)) and "loaded" not in self.problems:
+        if (unreadable := dict(self.database.unreadable)) and "loaded" not in self.problems:
             key, reason = next(iter(unreadable.items()))
             more = f", and {len(unreadable) - 1:,} more" if len(unreadable) > 1 else ""
             problems.append(f"chunk {key.text} cannot be read: {reason}{more}")
@@ -516,8 +516,8 @@ class PagedMap:
             self._observer.scan_durable(scan)
 
     def write_record(self, applied: dict[int, int] | None) -> None:
-        """Write the record in a file thread; ``applied`` as in `MapFiles.write_record`."""
-        self._threads.start([Job(partial(self.files.write_record, applied), self._recorded)])
+        """Write the record in a file thread; ``applied`` as in `MapDatabase.write_record`."""
+        self._threads.start([Job(partial(self.database.write_record, applied), self._recorded)])
 
     def _recorded(self, future: Future[None], now_s: float) -> None:
         del now_s
@@ -540,8 +540,8 @@ class PagedMap:
         return max(0.0, self._end_s - time.monotonic())
 
     def _finish(self, applied: dict[int, int] | None) -> None:
-        self.files.write_record(applied)
-        self.files.finish()
+        self.database.write_record(applied)
+        self.database.finish()
 
     def remove_from_memory(self) -> None:
         """Evict all chunks."""
@@ -554,7 +554,7 @@ class PagedMap:
         for done in self._threads.close(self._left_s()):
             if isinstance(done, ChunkFile):
                 done.close()  # loaded after the last turn
-        self.files.close(self._left_s())
+        self.database.close(self._left_s())
         for file in self.chunks.values():
             file.close()
         self.chunks.clear()

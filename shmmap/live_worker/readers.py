@@ -141,13 +141,13 @@ class Readers:
 
     def __init__(
         self,
-        live: PagedMap,
+        paged: PagedMap,
         changes: Changes,
         answer: Callable[[int, Any], None],
         wake: Callable[[], None],
     ) -> None:
-        self.live, self.changes, self._answer = live, changes, answer
-        self.lists = VoxelLists(live)
+        self.paged, self.changes, self._answer = paged, changes, answer
+        self.lists = VoxelLists(paged)
         self._ready: dict[int, deque[_Work]] = {}  # by session, the next one first
         self._later: list[tuple[float, _Work]] = []
         self._in_thread: dict[int, deque[tuple[_Work, Callable[[], Any]]]] = {}  # by session, one at a time
@@ -283,10 +283,10 @@ class Readers:
         self, area: LiveArea | None, indexes: list[KeyIndex], since: int, after: ChunkKey | None
     ) -> Iterator[list[ChunkKey]]:
         """Yield chunks that touch an area, in order, one list per step; chunks in memory only if changed."""
-        resolution = self.live.resolution
+        resolution = self.paged.resolution
         few = (
             self.changes.newer(since, FEW_CHANGES)
-            if since and indexes == [self.live.residency.index]
+            if since and indexes == [self.paged.residency.index]
             else None
         )
         if few is not None:
@@ -300,7 +300,7 @@ class Readers:
             yield [
                 key
                 for key in keys
-                if (not since or key not in self.live.chunks or self.changes.is_newer(key, since))
+                if (not since or key not in self.paged.chunks or self.changes.is_newer(key, since))
                 and touches(area, key, resolution)
             ]
             if last is None:
@@ -308,17 +308,17 @@ class Readers:
 
     def _page(self, message: messages.LiveChunks) -> Steps:
         """List chunks."""
-        live, area, change = self.live, message.area, self.changes.number
+        paged, area, change = self.paged, message.area, self.changes.number
         known = not message.since or self.changes.known(message.since)
         since = message.since if known else 0
         gone = []
         if since and message.after is None:
             for number, key in enumerate(self.changes.gone(since), 1):
-                if touches(area, key, live.resolution):
+                if touches(area, key, paged.resolution):
                     gone.append(key)
                 if number % KEYS_PER_STEP == 0:
                     yield None
-        indexes = [live.residency.index, *([live.stored] if message.saved else [])]
+        indexes = [paged.residency.index, *([paged.stored] if message.saved else [])]
         after = ChunkKey(*message.after) if message.after is not None else None
         rows: list[messages.LiveChunkRow] = []
         for keys in self._keys(area, indexes, since, after):
@@ -332,15 +332,15 @@ class Readers:
         page = tuple(rows[: messages.MAX_CHUNK_ROWS])
         lacking = {}
         if message.after is None:
-            lacking = yield from lacking_chunks(live, area)
+            lacking = yield from lacking_chunks(paged, area)
         return messages.LiveChunkPage(
             message.request, change, page, len(rows) > len(page), tuple(gone), known, *shown(lacking)
         )
 
     def _row(self, key: ChunkKey) -> messages.LiveChunkRow | None:
-        there, known = self.live.chunks.get(key), self.live.residency.chunks.get(key)
+        there, known = self.paged.chunks.get(key), self.paged.residency.chunks.get(key)
         if there is None or known is None:
-            row = self.live.files.rows.get(key)
+            row = self.paged.database.rows.get(key)
             if known is None and row is None:
                 return None
             row = row or NOTHING
@@ -362,9 +362,9 @@ class Readers:
         since = message.since if self.changes.known(message.since) else 0
         indexes = []
         if message.scope != "disk":
-            indexes.append(self.live.residency.index)
+            indexes.append(self.paged.residency.index)
         if message.scope != "memory" and not since:
-            indexes.append(self.live.stored)
+            indexes.append(self.paged.stored)
         keys = self._keys(message.area, indexes, since, None) if indexes else iter(())
         reply = yield from self.lists.collect(message, keys, ask.session, change)
         return reply

@@ -20,7 +20,7 @@ from shmmap.errors import BadRequest, Busy, CannotWrite, InternalError, NotPermi
 from shmmap.live_messages import MAX_PER_SESSION, Ask
 from shmmap.live_settings import LiveSettings
 from shmmap.live_worker.chunk_memory import ChunkMemory
-from shmmap.live_worker.disk.map_files import MapFiles
+from shmmap.live_worker.disk.map_database import MapDatabase
 from shmmap.live_worker.mappers import APPLIED_BYTES, ActiveMapper, AppliedScans, Mappers
 from shmmap.live_worker.marks_directory import MAX_MARKS_BYTES, MarksDirectory
 from shmmap.live_worker.paged_map import PagedMap
@@ -74,8 +74,9 @@ class ServedMap:
 
     Parameters
     ----------
-    files, memory, limits
-        The map's files, memory and limits; `adopt` takes over the chunks that a previous run left in memory.
+    database, memory, limits
+        The map on disk, its memory and its limits; `adopt` takes over the chunks that a previous run left in
+        memory.
     marks
         Directory where mappers put marks.
     answer
@@ -89,7 +90,7 @@ class ServedMap:
     def __init__(
         self,
         settings: LiveSettings,
-        files: MapFiles,
+        database: MapDatabase,
         memory: ChunkMemory,
         limits: Limits,
         marks: MarksDirectory,
@@ -98,10 +99,10 @@ class ServedMap:
         codec: str = "zlib",
     ) -> None:
         self.settings = settings
-        self.live = PagedMap(files, memory, limits, self, wake, codec)
+        self.paged = PagedMap(database, memory, limits, self, wake, codec)
         self.changes = Changes(time.time_ns())
-        self.mappers = Mappers(files, AppliedScans(memory.record("applied", APPLIED_BYTES)))
-        self.readers = Readers(self.live, self.changes, answer, wake)
+        self.mappers = Mappers(database, AppliedScans(memory.record("applied", APPLIED_BYTES)))
+        self.readers = Readers(self.paged, self.changes, answer, wake)
         self._marks = marks
         self._answer = answer
         self._tickets: dict[tuple[int, int], list[_Ticket]] = {}  # of scans accepted and not applied yet
@@ -119,8 +120,8 @@ class ServedMap:
     def adopt(self, now_s: float) -> int:
         """Take over the chunks that a previous run left in memory; return how many; see `PagedMap.adopt`."""
         self.readers.lists.remove_all()
-        adopted = self.live.adopt(now_s)
-        self._adopted = self.live.not_durable()
+        adopted = self.paged.adopt(now_s)
+        self._adopted = self.paged.not_durable()
         return adopted
 
     # --- requests -------------------------------------------------------------------------------
@@ -137,7 +138,7 @@ class ServedMap:
             self._move(ask.session, message.position, now_s)
             self._answer(ask.ticket, messages.LiveMoved(message.request, self.changes.number))
         elif isinstance(message, messages.LiveSave):
-            self._saves.append((ask, message, self.live.not_durable()))
+            self._saves.append((ask, message, self.paged.not_durable()))
         elif isinstance(message, messages.LiveChunks | messages.LiveVoxels):
             self.readers.begin(ask, message)
         elif isinstance(message, messages.LiveRelease):
@@ -145,7 +146,7 @@ class ServedMap:
             self._answer(ask.ticket, messages.LiveReleased(message.request))
 
     def _open(self, ask: Ask, message: messages.LiveOpen) -> None:
-        live, fixed = self.live, self.live.files.settings
+        paged, fixed = self.paged, self.paged.database.settings
         if message.frame_id not in ("", fixed.frame_id):
             raise BadRequest(
                 f"live map {self.settings.name} is in frame {fixed.frame_id!r}, not {message.frame_id!r}",
@@ -155,7 +156,7 @@ class ServedMap:
         above, below = fixed.occupancy.thresholds
         reply = messages.LiveOpened(
             message.request,
-            live.files.map_id,
+            paged.database.map_id,
             fixed.resolution,
             fixed.frame_id,
             hit,
@@ -164,8 +165,8 @@ class ServedMap:
             high,
             above,
             below,
-            live.memory.path,
-            live.memory.prefix,
+            paged.memory.path,
+            paged.memory.prefix,
             probabilities=msgspec.structs.astuple(fixed.occupancy),
         )
         if not message.mapper:
@@ -177,7 +178,7 @@ class ServedMap:
             reply.mapper, reply.next_scan = active.mapper.number, self.mappers.next_scan(active)
             reply.applied = active.applied
             reply.marks_dir = self._marks.path
-            reply.max_marks_bytes = min(MAX_MARKS_BYTES, live.limits.budget_bytes // MARKS_PART)
+            reply.max_marks_bytes = min(MAX_MARKS_BYTES, paged.limits.budget_bytes // MARKS_PART)
             self._answer(ask.ticket, reply)
 
         open_mapper = partial(self.mappers.open, ask.uid, message.mapper, ask.session)
@@ -201,7 +202,7 @@ class ServedMap:
                 hint = f"see to {self.settings.path}; what is in memory stays there"
                 self._refuse(ask, request, CannotWrite(text, hint=hint))
 
-        self.live.on_disk(work, written)
+        self.paged.on_disk(work, written)
 
     def _scan(self, ask: Ask, message: messages.LiveScan, now_s: float) -> None:
         expect = partial(self.mappers.expect, message.mapper, message.scan, ask.session)
@@ -227,7 +228,7 @@ class ServedMap:
 
         Scans that are accepted are applied all the same.
         """
-        if not (problem := self.live.problem):
+        if not (problem := self.paged.problem):
             return
         before_s = now_s - SAY_WHY_S
         late = [ticket for ticket, _, _ in self._waiting if ticket.since_s <= before_s]
@@ -244,7 +245,7 @@ class ServedMap:
 
     def _accept_scans(self) -> None:
         """Accept waiting scans while there is memory; the others stay in the directory of marks."""
-        while self._waiting and self.live.residency.has_room(self._waiting[0][2].bytes):
+        while self._waiting and self.paged.residency.has_room(self._waiting[0][2].bytes):
             ticket, ask, message = self._waiting.popleft()
             try:
                 self._accept(ticket, ask, message)
@@ -263,29 +264,29 @@ class ServedMap:
             self._add_ticket(tickets, ticket)
             return
         data = self._marks.take(message.marks, message.bytes, ask.session, ask.uid)
-        marks = decode_marks(data, self.live.files.map_id, message.mapper, message.scan)
+        marks = decode_marks(data, self.paged.database.map_id, message.mapper, message.scan)
         self.mappers.accepted(active, message.scan)
         self._tickets[message.mapper, message.scan] = [ticket]
-        self.live.add(message.mapper, message.scan, marks, message.bytes)
+        self.paged.add(message.mapper, message.scan, marks, message.bytes)
 
     def _move(self, session: int, position: tuple[float, float, float], now_s: float) -> None:
         """Move a client: load chunks near its place and near its predicted place."""
-        reach = FURTHEST_SENSOR * self.live.resolution
+        reach = FURTHEST_SENSOR * self.paged.resolution
         if not all(-reach < value < reach for value in position):
             raise BadRequest(f"position {position}: it is not finite, or too far away")
-        self.live.move(session, position)
+        self.paged.move(session, position)
         before = self._places.get(session)
         self._places[session] = _Place(position, now_s)
         if before is None or now_s <= before.seen_s:
             return
-        longest = MAX_AHEAD_CHUNKS * CHUNK_SIDE * self.live.resolution
+        longest = MAX_AHEAD_CHUNKS * CHUNK_SIDE * self.paged.resolution
         ahead = place_ahead(before.xyz, position, now_s - before.seen_s, AHEAD_S, longest)
-        self.live.move((session, "ahead"), ahead)
+        self.paged.move((session, "ahead"), ahead)
 
     def on_disconnect(self, session: int) -> None:
         """Handle the end of a session: accepted scans are applied, other requests dropped."""
         for client in (session, (session, "ahead")):
-            self.live.residency.leave(client)
+            self.paged.residency.leave(client)
         self._places.pop(session, None)
         self._writing = {ticket: one for ticket, one in self._writing.items() if one != session}
         self.mappers.on_disconnect(session)
@@ -341,7 +342,7 @@ class ServedMap:
                 self._saves.append((ask, message, left))
                 continue
             mine = [one.durable for one in self.mappers.by_number.values() if one.session == ask.session]
-            files = len(self.live.files.rows)
+            files = len(self.paged.database.rows)
             self._answer(ask.ticket, messages.LiveDurable(message.request, max(mine, default=0), files))
 
     # --- turns ----------------------------------------------------------------------------------
@@ -350,25 +351,25 @@ class ServedMap:
         """Do the work that is possible now."""
         self._accept_scans()
         self.readers.lists.expire(now_s)
-        residency = self.live.residency
+        residency = self.paged.residency
         marks_bytes = sum(min(message.bytes, MAX_MARKS_BYTES) for _, _, message in self._waiting)
         residency.beside_bytes += marks_bytes - self._marks_bytes
         self._marks_bytes = marks_bytes
         residency.asked_bytes = self.readers.lists.asked_bytes
-        self.live.run_turn(now_s, time.time_ns(), save_all=save_all or bool(self._saves))
+        self.paged.run_turn(now_s, time.time_ns(), save_all=save_all or bool(self._saves))
         self._say_why(now_s)
         if self._saves:
             self._answer_saves()
         self.readers.run_turn(now_s)
         due = now_s >= self._record_s and self.changes.number != self._recorded
-        if due or self.live.files.record_is_due:
-            self.live.files.record_is_due = False
+        if due or self.paged.database.record_is_due:
+            self.paged.database.record_is_due = False
             self._record_s, self._recorded = now_s + RECORD_S, self.changes.number
-            self.live.write_record(self._durable_scans())
+            self.paged.write_record(self._durable_scans())
 
     def next_turn_s(self, now_s: float) -> float:
         """Return the time at which the next turn is due, if nothing happens before."""
-        residency = self.live.residency
+        residency = self.paged.residency
         first_fits = bool(self._waiting) and residency.has_room(self._waiting[0][2].bytes)
         if first_fits or residency.is_ready:
             return now_s
@@ -376,32 +377,33 @@ class ServedMap:
 
     def status(self) -> messages.LiveMapRow:
         """Return the state of the map."""
-        live, residency, now_s = self.live, self.live.residency, time.monotonic()
+        paged, residency, now_s = self.paged, self.paged.residency, time.monotonic()
         self.readers.measure(now_s)
         if now_s >= self._files_s:
             self._files_s = now_s + FILES_S
-            self._file_bytes = sum(row.bytes for row in list(live.files.rows.values()))  # other threads save
-        losses, losses_count = live.files.losses(MAX_LOSSES)
+            rows = list(paged.database.rows.values())  # other threads save
+            self._file_bytes = sum(row.bytes for row in rows)
+        losses, losses_count = paged.database.losses(MAX_LOSSES)
         return messages.LiveMapRow(
             self.settings.name,
             self.settings.path,
-            live.resolution,
-            live.files.settings.frame_id,
-            chunks=len(live.chunks),
+            paged.resolution,
+            paged.database.settings.frame_id,
+            chunks=len(paged.chunks),
             active=residency.active,
             bytes=residency.chunk_bytes,
-            loading=len(residency.chunks) - len(live.chunks),
+            loading=len(residency.chunks) - len(paged.chunks),
             dirty=residency.dirty,
             saving=residency.saving,
             waiting_bytes=residency.waiting_bytes,
-            files=len(live.files.rows),
+            files=len(paged.database.rows),
             file_bytes=self._file_bytes,
             scans=self._scans,
             durable=self._durable,
-            budget_bytes=live.limits.budget_bytes,
+            budget_bytes=paged.limits.budget_bytes,
             damaged=losses,
             mappers=tuple(f"{one.mapper.uid}/{one.mapper.name}" for one in self.mappers.by_number.values()),
-            problem=live.problem,
+            problem=paged.problem,
             change=self.changes.number,
             beside_bytes=residency.beside_bytes,
             readers=self.readers.busiest,
@@ -414,7 +416,7 @@ class ServedMap:
     @property
     def is_saved(self) -> bool:
         """Whether all scans are on disk."""
-        return self.live.all_durable
+        return self.paged.all_durable
 
     def stop_accepting(self) -> None:
         """Stop accepting scans: waiting scans are sent again to the next run."""
@@ -424,11 +426,11 @@ class ServedMap:
         """Close the map; return the number of unsaved chunks, which stay in memory."""
         self.readers.close()
         self.readers.lists.remove_all()
-        unsaved = self.live.unsaved
+        unsaved = self.paged.unsaved
         if not keep and not unsaved:
-            self.live.finish(self._durable_scans())
-            self.live.remove_from_memory()
-        self.live.close()
+            self.paged.finish(self._durable_scans())
+            self.paged.remove_from_memory()
+        self.paged.close()
         return unsaved
 
 

@@ -82,7 +82,7 @@ class VoxelLists:
         Whether the lists are closed: threads then read no further file.
     """
 
-    live: PagedMap
+    paged: PagedMap
     _lists: list[_List] = field(default_factory=list)
     _making: int = 0
     _asked: list[int] = field(default_factory=list)
@@ -134,21 +134,21 @@ class VoxelLists:
             for some in keys:
                 cold: list[ChunkKey] = []
                 for key in some:
-                    there = self.live.chunks.get(key)
+                    there = self.paged.chunks.get(key)
                     if message.scope != "disk" and there is not None:
                         keep(pick(there.view))
                         yield None
-                    elif message.scope != "memory" and key in self.live.files.rows:
+                    elif message.scope != "memory" and key in self.paged.database.rows:
                         cold.append(key)
                 for first in range(0, len(cold), FILES_PER_STEP):
                     found, lost = yield partial(self._read, cold[first : first + FILES_PER_STEP], pick)
                     for part in found:
                         keep(part)
                     for key in lost:
-                        self.live.note_lost(key, time.monotonic())
+                        self.paged.note_lost(key, time.monotonic())
                         lacking[key] = "what was saved is damaged"
                 yield None
-            lacking |= yield from lacking_chunks(self.live, message.area)
+            lacking |= yield from lacking_chunks(self.paged, message.area)
             yield from self._room(_pages(made))
             name = yield from self._write(parts, made, session)
         finally:
@@ -157,7 +157,7 @@ class VoxelLists:
         return LiveVoxelsReply(message.request, change, name, count, made, *shown(lacking))
 
     def _check(self, made: int, kind: str) -> None:
-        most = self.live.limits.budget_bytes // PART_OF_BUDGET
+        most = self.paged.limits.budget_bytes // PART_OF_BUDGET
         if self.nbytes + self._making > most:
             raise OverBudget(
                 f"{made // VOXEL_BYTES} voxels and more are {kind} there: all lists together may take {most}"
@@ -169,7 +169,7 @@ class VoxelLists:
         indices, log_odds = select_voxels(view, message.kind)
         if message.area is None:
             return indices, log_odds
-        wanted = inside(message.area, voxel_centers(indices, self.live.resolution))
+        wanted = inside(message.area, voxel_centers(indices, self.paged.resolution))
         return indices[wanted], log_odds[wanted]
 
     def _read(
@@ -182,7 +182,7 @@ class VoxelLists:
             if self.is_closed:
                 break
             try:
-                data = self.live.files.load(key)
+                data = self.paged.database.load(key)
             except OSError as error:
                 raise MapDataError(
                     f"it cannot be read: {error.strerror}", path=key.text, cause="unreadable"
@@ -198,7 +198,7 @@ class VoxelLists:
         until_s = time.monotonic() + ROOM_S
         self._asked.append(nbytes)
         try:
-            while nbytes and not self.live.residency.fits(nbytes):
+            while nbytes and not self.paged.residency.fits(nbytes):
                 if time.monotonic() >= until_s:
                     raise OverBudget(
                         f"a list of {nbytes} bytes has no room: chunks that cannot be saved take all of it",
@@ -211,12 +211,12 @@ class VoxelLists:
     def _write(
         self, parts: list[_Part], nbytes: int, session: int
     ) -> Generator[Callable[[], Any] | Later | None, Any, str]:
-        memory = self.live.memory
+        memory = self.paged.memory
         one = _List(session, f"{memory.prefix}{NAME}{secrets.token_hex(8)}", _pages(nbytes), math.inf)
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW
         fd = os.open(memory.path + one.name, flags, 0o600)
         self._lists.append(one)
-        self.live.residency.beside_bytes += one.nbytes
+        self.paged.residency.beside_bytes += one.nbytes
         try:
             for column in (0, 1):
                 for part in parts:
@@ -254,20 +254,20 @@ class VoxelLists:
     def remove_all(self) -> None:
         """Remove all lists, including those of previous runs."""
         self._remove(list(self._lists))
-        start = self.live.memory.prefix.lstrip("/") + NAME
-        for name in os.listdir(self.live.memory.path):
+        start = self.paged.memory.prefix.lstrip("/") + NAME
+        for name in os.listdir(self.paged.memory.path):
             if name.startswith(start):
                 self._free("/" + name)
 
     def _remove(self, lists: list[_List]) -> None:
         for one in lists:
             self._lists.remove(one)
-            self.live.residency.beside_bytes -= one.nbytes
+            self.paged.residency.beside_bytes -= one.nbytes
             self._free(one.name)
 
     def _free(self, name: str) -> None:
         """Free a file's memory, even while readers use it, and remove its name."""
-        path = self.live.memory.path + name
+        path = self.paged.memory.path + name
         with contextlib.suppress(FileNotFoundError, PermissionError):  # files of other users are left alone
             try:
                 fd = os.open(path, os.O_WRONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)

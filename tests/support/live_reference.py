@@ -18,7 +18,7 @@ from shmmap.chunks.marking import Marker
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.client.live.live_map import ChunkInfo, LiveMap
 from shmmap.live_worker.disk.folder import Folder
-from shmmap.live_worker.disk.map_files import MapFiles
+from shmmap.live_worker.disk.map_database import MapDatabase
 from shmmap.live_worker.disk.map_record import MapSettings, Row
 from tests.support.chunk_memory import ChunkMemory
 from tests.support.daemon_process import DaemonProcess
@@ -77,11 +77,11 @@ def stored_drive(
     codec: str = "zlib",
 ) -> dict[Voxel, int]:
     """Map a drive, moved by metres, and save it; returns all voxels known."""
-    with closing(Folder(directory)) as folder, closing(MapFiles(folder, settings)) as files:
-        memory = _driven(scans, shift, settings, files.map_id)
+    with closing(Folder(directory)) as folder, closing(MapDatabase(folder, settings)) as database:
+        memory = _driven(scans, shift, settings, database.map_id)
         for key, view in memory.chunks.items():
-            files.save(key, encode_chunk(view, codec))
-        files.write_record()
+            database.save(key, encode_chunk(view, codec))
+        database.write_record()
     return memory.voxels()
 
 

@@ -76,7 +76,7 @@ class CheckedMap(msgspec.Struct):
         return sum(getattr(row, what) for row in self.rows.values())
 
 
-def check(files: FolderToRead, path: str) -> CheckedMap:
+def check(folder: FolderToRead, path: str) -> CheckedMap:
     """Read every chunk completely, without changing anything; other processes may be using the database.
 
     Raises
@@ -87,7 +87,7 @@ def check(files: FolderToRead, path: str) -> CheckedMap:
         A chunk is compressed by a package that is not installed.
     """
     try:
-        with StoredMap(files, path) as stored:
+        with StoredMap(folder, path) as stored:
             rows, lost = dict(stored.rows), dict(stored.lost)
             for key, row in stored.rows.items():
                 try:
@@ -102,7 +102,7 @@ def check(files: FolderToRead, path: str) -> CheckedMap:
         if error.cause != TABLES_DAMAGED:
             raise
         damaged = error.message.removeprefix(f"{path}: ")
-        found, record = _salvaged(files, error)
+        found, record = _salvaged(folder, error)
         rows = {key: row for key, (row, _) in found.rows.items()}
         lost = record.lost_chunks
         for key, version in found.names.items():
@@ -120,22 +120,22 @@ def check(files: FolderToRead, path: str) -> CheckedMap:
             LostChunk(key.text, one.version, rows[key].version if key in rows else 0, one.reason)
             for key, one in sorted(lost.items())
         ],
-        asides(files),
+        asides(folder),
     )
 
 
-def _salvaged(files: FolderToRead, why: MapDataError) -> tuple[Salvage, MapRecord]:
+def _salvaged(folder: FolderToRead, why: MapDataError) -> tuple[Salvage, MapRecord]:
     """Return what is left of a database, and the map's record: of that, or its copy."""
-    found = salvage(files, None)
+    found = salvage(folder, None)
     record = found.record
     with contextlib.suppress(OSError, MapDataError):
-        record = record or read_map(files)
+        record = record or read_map(folder)
     if record is None:
         raise why
     return found, record
 
 
-def repair(files: Folder, found: CheckedMap) -> None:
+def repair(folder: Folder, found: CheckedMap) -> None:
     """Make a database of the good chunks, which names none that is lost; put the old one aside.
 
     ``found`` is updated.  Nothing is deleted.
@@ -147,9 +147,9 @@ def repair(files: Folder, found: CheckedMap) -> None:
     """
     if found.good:
         return
-    _, record = _salvaged(files, MapDataError("the record is damaged", path=found.path))
+    _, record = _salvaged(folder, MapDataError("the record is damaged", path=found.path))
     record.lost = {}
-    _, found.rebuilt_from = rebuild(files, record, {}, found.damaged or "chunks are lost")
+    _, found.rebuilt_from = rebuild(folder, record, {}, found.damaged or "chunks are lost")
 
 
 class ResetMap(msgspec.Struct, frozen=True):
@@ -161,17 +161,17 @@ class ResetMap(msgspec.Struct, frozen=True):
     bytes: int
 
 
-def files_of_map(files: FolderToRead) -> dict[str, int]:
+def files_of_map(folder: FolderToRead) -> dict[str, int]:
     """Return the sizes of the map's own files, in the order in which they may be removed.
 
     If the process is killed in between, a valid live map remains: the database goes last, or ``map.json``,
     without which the files of an earlier version are meaningless.
     """
-    names = files.names()
+    names = folder.names()
     own = (DATABASE + ".", f".{MAP_FILE}.", LOG, SHARED)
     others = sorted(name for name in names if name.startswith(own))
     last = [name for name in (MAP_FILE, DATABASE) if name in names]
-    return {name: files.size(name) for name in [*OldFiles.of(names).all, *others, *last]}
+    return {name: folder.size(name) for name in [*OldFiles.of(names).all, *others, *last]}
 
 
 def reset(folder: Folder, *, delete: bool) -> ResetMap:

@@ -168,7 +168,7 @@ def decoded(data: bytes | str, decoder: msgspec.json.Decoder[_T], name: str) -> 
         raise MapDataError(f"it is damaged: {reason}", path=name) from error
 
 
-def read_map(files: FolderToRead) -> MapRecord:
+def read_map(folder: FolderToRead) -> MapRecord:
     """Read ``map.json``, which may be that of a directory without a database.
 
     Raises
@@ -178,7 +178,8 @@ def read_map(files: FolderToRead) -> MapRecord:
     OSError
         It cannot be read.
     """
-    return decode_map(whole_file(files, MAP_FILE, _MAX_MAP_BYTES), MAP_FILE, formats=(OLD_FORMAT, MAP_FORMAT))
+    data = whole_file(folder, MAP_FILE, _MAX_MAP_BYTES)
+    return decode_map(data, MAP_FILE, formats=(OLD_FORMAT, MAP_FORMAT))
 
 
 def decode_map(data: bytes | str, path: str, *, formats: tuple[int, ...] = (MAP_FORMAT,)) -> MapRecord:
@@ -210,9 +211,9 @@ def _is_key(text: str) -> bool:
     return True
 
 
-def whole_file(files: FolderToRead, name: str, most: int) -> bytes:
+def whole_file(folder: FolderToRead, name: str, most: int) -> bytes:
     """Return a whole file of at most ``most`` bytes; raise as `read_map`."""
-    data = files.read(name, most + 1)
+    data = folder.read(name, most + 1)
     if len(data) > most:
         raise MapDataError(f"it has more than {most:,} bytes", path=name, cause="too_long")
     return data

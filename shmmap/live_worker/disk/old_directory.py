@@ -88,7 +88,7 @@ class OldFiles(NamedTuple):
 Chunks = Iterator[tuple[ChunkKey, Row, bytes]]
 
 
-def read_old_chunks(files: FolderToRead, record: MapRecord) -> Chunks:
+def read_old_chunks(folder: FolderToRead, record: MapRecord) -> Chunks:
     """Yield the newest good file of each chunk, and then complete the record with what is lost.
 
     Raises
@@ -98,10 +98,10 @@ def read_old_chunks(files: FolderToRead, record: MapRecord) -> Chunks:
     """
     candidates: dict[ChunkKey, list[tuple[int, str]]] = {}
     damaged: dict[str, str] = {}
-    for name in OldFiles.of(files.names()).chunks:
+    for name in OldFiles.of(folder.names()).chunks:
         with named(name):
             try:
-                header = read_file_header(files.read(name, FILE_HEADER_BYTES), name)
+                header = read_file_header(folder.read(name, FILE_HEADER_BYTES), name)
             except MapDataError as error:
                 damaged[name] = error.message
                 continue
@@ -115,7 +115,7 @@ def read_old_chunks(files: FolderToRead, record: MapRecord) -> Chunks:
     for key, names in candidates.items():
         for _, name in sorted(names, reverse=True):
             with named(name):
-                data = whole_file(files, name, _MAX_CHUNK_FILE_BYTES)
+                data = whole_file(folder, name, _MAX_CHUNK_FILE_BYTES)
             try:
                 rows[key] = Row.of(check_file(data, name))
             except MapDataError as error:
@@ -124,14 +124,14 @@ def read_old_chunks(files: FolderToRead, record: MapRecord) -> Chunks:
             yield key, rows[key], data
             break
     record.format = MAP_FORMAT
-    record.lost = {key.text: one for key, one in _lost(files, record, rows, damaged).items()}
+    record.lost = {key.text: one for key, one in _lost(folder, record, rows, damaged).items()}
 
 
 def _lost(
-    files: FolderToRead, record: MapRecord, rows: dict[ChunkKey, Row], damaged: dict[str, str]
+    folder: FolderToRead, record: MapRecord, rows: dict[ChunkKey, Row], damaged: dict[str, str]
 ) -> dict[ChunkKey, Lost]:
     """Return the chunks that were saved, and of which these rows lack something."""
-    listed = _read_manifest(files)
+    listed = _read_manifest(folder)
     sent = {mapper.number: mapper.scans for mapper in record.mappers}
     record.applied = {number: scan for number, scan in listed.applied.items() if scan < sent.get(number, 0)}
     found: dict[ChunkKey, Lost] = {}
@@ -153,13 +153,13 @@ def _lost(
     return found
 
 
-def _read_manifest(files: FolderToRead) -> _Manifest:
+def _read_manifest(folder: FolderToRead) -> _Manifest:
     nothing = _Manifest(OLD_FORMAT, {})
-    if MANIFEST not in files.names():
+    if MANIFEST not in folder.names():
         return nothing
     try:
         with named(MANIFEST):
-            found = decoded(whole_file(files, MANIFEST, MAX_BYTES - 1), _manifest, MANIFEST)
+            found = decoded(whole_file(folder, MANIFEST, MAX_BYTES - 1), _manifest, MANIFEST)
         for text in (*found.chunks, *found.missing):
             ChunkKey.from_text(text)
     except (MapDataError, BadRequest) as error:
@@ -168,37 +168,37 @@ def _read_manifest(files: FolderToRead) -> _Manifest:
     return found
 
 
-def put_old_files_aside(files: Folder) -> None:
+def put_old_files_aside(folder: Folder) -> None:
     """Move the files of an imported directory into one within it, in which they are the map that they were.
 
     One that a kill interrupted is completed: ``map.json`` is moved last.
     """
-    record = [MAP_FILE] if _is_old_record(files) else []
-    names = [*OldFiles.of(files.names()).all, *record]
+    record = [MAP_FILE] if _is_old_record(folder) else []
+    names = [*OldFiles.of(folder.names()).all, *record]
     if not names:
         return
-    begun = [one for one in files.names() if one.startswith(IMPORTED) and _takes(files, one, names)]
-    aside = begun[0] if begun else free_name(files, IMPORTED)
+    begun = [one for one in folder.names() if one.startswith(IMPORTED) and _takes(folder, one, names)]
+    aside = begun[0] if begun else free_name(folder, IMPORTED)
     if not begun:
-        os.mkdir(files.place(aside), mode=0o700)
+        os.mkdir(folder.place(aside), mode=0o700)
     for name in names:
-        files.rename(name, f"{aside}/{name}")
-    files.sync_names()
+        folder.rename(name, f"{aside}/{name}")
+    folder.sync_names()
     log.warning(
-        "old files of a live map imported and kept", directory=f"{files.path}/{aside}", files=len(names)
+        "old files of a live map imported and kept", directory=f"{folder.path}/{aside}", files=len(names)
     )
 
 
-def _takes(files: FolderToRead, aside: str, names: list[str]) -> bool:
+def _takes(folder: FolderToRead, aside: str, names: list[str]) -> bool:
     """Return whether this is a directory in which files may still be put: nothing is replaced there."""
     try:
-        return not {MAP_FILE, *names}.intersection(os.listdir(files.place(aside)))
+        return not {MAP_FILE, *names}.intersection(os.listdir(folder.place(aside)))
     except NotADirectoryError:
         return False
 
 
-def _is_old_record(files: FolderToRead) -> bool:
+def _is_old_record(folder: FolderToRead) -> bool:
     try:
-        return read_map(files).format == OLD_FORMAT
+        return read_map(folder).format == OLD_FORMAT
     except (OSError, MapDataError):
         return False

@@ -41,7 +41,7 @@ _MAP_COLUMNS: Final = 2
 
 
 def make_database(
-    files: Folder, record: MapRecord, chunks: Iterable[tuple[ChunkKey, Row, bytes]] = ()
+    folder: Folder, record: MapRecord, chunks: Iterable[tuple[ChunkKey, Row, bytes]] = ()
 ) -> None:
     """Write a database under its interim name, durably.
 
@@ -55,56 +55,56 @@ def make_database(
     OSError
         The disk is full, or fails.
     """
-    remove_unfinished(files)
+    remove_unfinished(folder)
     try:
-        files.write(NEW, b"")  # for this user alone
-        with database_errors(files), contextlib.closing(connect(files, NEW)) as database:
+        folder.write(NEW, b"")  # for this user alone
+        with database_errors(folder), contextlib.closing(connect(folder, NEW)) as database:
             make_tables(database)
             for number, (key, row, data) in enumerate(chunks, 1):
                 database.execute(PUT_CHUNK, chunk_values(number, key.text, row, data))
             database.execute("insert into map values(0, ?)", (msgspec.json.encode(record).decode(),))
             database.execute("commit")
-            require_log(database, files)  # from the first on: it never has a journal
-        files.sync(NEW)
+            require_log(database, folder)  # from the first on: it never has a journal
+        folder.sync(NEW)
     except Exception:
-        remove_unfinished(files)  # a full disk has its room back
+        remove_unfinished(folder)  # a full disk has its room back
         raise
 
 
-def remove_unfinished(files: Folder) -> None:
+def remove_unfinished(folder: Folder) -> None:
     """Remove a database that was not completed."""
     for name in (NEW, f"{NEW}-wal", f"{NEW}-shm", f"{NEW}-journal"):
         with contextlib.suppress(FileNotFoundError):
-            files.remove(name)
+            folder.remove(name)
 
 
-def put_in_place(files: Folder) -> None:
+def put_in_place(folder: Folder) -> None:
     """Give a complete database its name; the log of the one that had it is not there any more."""
-    files.rename(NEW, DATABASE)
-    files.sync_names()
+    folder.rename(NEW, DATABASE)
+    folder.sync_names()
     step("live.renamed")
 
 
-def replace_database(files: Folder, aside: str) -> None:
+def replace_database(folder: Folder, aside: str) -> None:
     """Put a database and its log aside, and the complete new one in its place.
 
     A kill in between leaves no database, never one without its log: `finish_replacing` does the rest.
     """
     for name, kept in ((DATABASE, aside), (LOG, f"{aside}-wal")):
         with contextlib.suppress(FileNotFoundError):
-            files.rename(name, kept)
-        files.sync_names()
+            folder.rename(name, kept)
+        folder.sync_names()
     with contextlib.suppress(FileNotFoundError):
-        files.remove(SHARED)
-    put_in_place(files)
+        folder.remove(SHARED)
+    put_in_place(folder)
 
 
-def finish_replacing(files: Folder) -> bool:
+def finish_replacing(folder: Folder) -> bool:
     """Do the rest of what a kill interrupted; return whether there was anything to do."""
-    names = files.names()
-    if DATABASE in names or NEW not in names or not (damaged := asides(files)):
+    names = folder.names()
+    if DATABASE in names or NEW not in names or not (damaged := asides(folder)):
         return False
-    replace_database(files, max(damaged, key=lambda name: os.stat(files.place(name)).st_ctime_ns))
+    replace_database(folder, max(damaged, key=lambda name: os.stat(folder.place(name)).st_ctime_ns))
     return True
 
 
@@ -126,12 +126,12 @@ class Salvage(NamedTuple):
     record: MapRecord | None
 
 
-def salvage(files: FolderToRead, map_id: bytes | None) -> Salvage:
+def salvage(folder: FolderToRead, map_id: bytes | None) -> Salvage:
     """Read what is left; ``map_id`` is that of the chunks that count, None for all.
 
     No connection of this process may be open: closing a descriptor would drop its locks.
     """
-    with _opened(files) as pages:
+    with _opened(folder) as pages:
         return _salvage(pages, map_id)
 
 
@@ -156,7 +156,7 @@ def _salvage(pages: Pages, map_id: bytes | None) -> Salvage:
 
 
 def rebuild(
-    files: Folder, record: MapRecord | None, known: Mapping[ChunkKey, int] | None, reason: str
+    folder: Folder, record: MapRecord | None, known: Mapping[ChunkKey, int] | None, reason: str
 ) -> tuple[MapRecord, str]:
     """Make a database from what is left of a damaged one, and put that aside; return its name there.
 
@@ -176,7 +176,7 @@ def rebuild(
     OSError
         The disk is full, or fails: the damaged database is as it was.
     """
-    with _opened(files) as pages:
+    with _opened(folder) as pages:
         found = _salvage(pages, bytes.fromhex(record.map_id) if record is not None else None)
         record = record or found.record
         if record is None:
@@ -187,9 +187,9 @@ def rebuild(
                 lost[key] = Lost(version, reason)
         record.lost = {key.text: one for key, one in lost.items()}
         record.damaged = []
-        make_database(files, record, _chunks(pages, found))
-    aside = free_name(files, DATABASE + DAMAGED)
-    replace_database(files, aside)
+        make_database(folder, record, _chunks(pages, found))
+    aside = free_name(folder, DATABASE + DAMAGED)
+    replace_database(folder, aside)
     log.error(
         "database of a live map rebuilt", kept=aside, chunks=len(found.rows), lost=len(lost), reason=reason
     )
@@ -217,12 +217,12 @@ def _good_chunk(values: list[Any], map_id: bytes | None) -> tuple[ChunkKey, Row,
 
 
 @contextlib.contextmanager
-def _opened(files: FolderToRead) -> Iterator[Pages]:
+def _opened(folder: FolderToRead) -> Iterator[Pages]:
     with contextlib.ExitStack() as closing:
         descriptors = []
         for name in (DATABASE, LOG):
-            files.require_regular(name)
+            folder.require_regular(name)
             with contextlib.suppress(FileNotFoundError):
-                descriptors.append(os.open(files.place(name), os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW))
+                descriptors.append(os.open(folder.place(name), os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW))
                 closing.callback(os.close, descriptors[-1])
         yield Pages(descriptors[0], descriptors[1] if len(descriptors) > 1 else None)

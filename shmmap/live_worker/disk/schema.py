@@ -79,7 +79,7 @@ def chunk_values(number: int, key: str, row: Row, data: bytes) -> tuple[object, 
     return number, key, *msgspec.structs.astuple(row), padding(data), data
 
 
-def require_local_disk(files: FolderToRead) -> None:
+def require_local_disk(folder: FolderToRead) -> None:
     """Refuse a directory on a network file system, where processes do not share the log's index.
 
     Raises
@@ -87,16 +87,16 @@ def require_local_disk(files: FolderToRead) -> None:
     ConfigError
         It is on one.
     """
-    kind = mount_of(files.path).kind
+    kind = mount_of(folder.path).kind
     if kind in REMOTE:
         raise ConfigError(
-            f"{files.path} is on a network file system ({kind}), which a live map's database cannot use",
+            f"{folder.path} is on a network file system ({kind}), which a live map's database cannot use",
             key="path",
             hint="choose a directory on a disk of this machine",
         )
 
 
-def require_own_files(files: FolderToRead) -> None:
+def require_own_files(folder: FolderToRead) -> None:
     """Refuse what is no regular file, and a journal, from which SQLite would overwrite pages.
 
     Raises
@@ -108,8 +108,8 @@ def require_own_files(files: FolderToRead) -> None:
     """
     for name in (DATABASE, LOG, SHARED):
         with named(name):
-            files.require_regular(name)
-    if JOURNAL in files.names():
+            folder.require_regular(name)
+    if JOURNAL in folder.names():
         raise MapDataError(
             "no daemon makes it: another program was changing the database, or it is of another one",
             path=JOURNAL,
@@ -117,12 +117,12 @@ def require_own_files(files: FolderToRead) -> None:
         )
 
 
-def connect(files: FolderToRead, name: str = DATABASE, *, mode: str = "rw") -> sqlite3.Connection:
+def connect(folder: FolderToRead, name: str = DATABASE, *, mode: str = "rw") -> sqlite3.Connection:
     """Open a database in a directory, wherever that was moved; raise as `database_errors` converts.
 
     Other processes are never waited for: what is locked is an error, and tried again later.
     """
-    path = f"file:{files.place(name)}?mode={mode}"
+    path = f"file:{folder.place(name)}?mode={mode}"
     return sqlite3.connect(path, timeout=0, isolation_level=None, check_same_thread=False, uri=True)
 
 
@@ -137,12 +137,12 @@ def check_tables(database: sqlite3.Connection) -> None:
         raise MapDataError(f"format {found}; this reads {_FORMAT}", path=DATABASE)
 
 
-def require_log(database: sqlite3.Connection, files: FolderToRead) -> None:
+def require_log(database: sqlite3.Connection, folder: FolderToRead) -> None:
     """Have a log for a database; raise `ConfigError` where SQLite cannot."""
     (mode,) = database.execute("pragma journal_mode = wal").fetchone()
     if mode != "wal":
         raise ConfigError(
-            f"{files.path}: SQLite cannot keep a log there (journal_mode {mode})",
+            f"{folder.path}: SQLite cannot keep a log there (journal_mode {mode})",
             key="path",
             hint="choose a directory on a disk of this machine",
         )
@@ -204,7 +204,7 @@ def make_tables(database: sqlite3.Connection) -> None:
 
 
 @contextlib.contextmanager
-def database_errors(files: FolderToRead) -> Iterator[None]:
+def database_errors(folder: FolderToRead) -> Iterator[None]:
     """Convert errors of SQLite.
 
     Raises
@@ -224,7 +224,7 @@ def database_errors(files: FolderToRead) -> Iterator[None]:
             ) from error
         if "locked" in text:
             raise OSError(errno.EAGAIN, "another process has locked its database") from error
-        disk = os.statvfs(files.place(""))
+        disk = os.statvfs(folder.place(""))
         free = disk.f_bavail * disk.f_frsize
         if "full" in text and free > _PLENTY:  # a damaged page has a number that no page can have
             raise MapDataError(
@@ -233,7 +233,7 @@ def database_errors(files: FolderToRead) -> Iterator[None]:
         if "full" in text or not free:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)) from error
         number = errno.EROFS if "readonly" in text else errno.EIO
-        if "unable to open" in text and not os.access(files.place(DATABASE), os.R_OK | os.W_OK):
+        if "unable to open" in text and not os.access(folder.place(DATABASE), os.R_OK | os.W_OK):
             number = errno.EACCES
         raise OSError(number, f"{os.strerror(number)} ({text})") from error
     except sqlite3.DatabaseError as error:

@@ -39,7 +39,7 @@ class StoredMap:
 
     Parameters
     ----------
-    files
+    folder
         The map's directory.
     path
         Path of the directory in error messages.
@@ -49,7 +49,7 @@ class StoredMap:
     map_id, settings
         As in the map's record.
     rows, lost
-        As in `MapFiles`.
+        As in `MapDatabase`.
     aside
         Damaged databases that were put aside before.
 
@@ -59,19 +59,19 @@ class StoredMap:
         The tables are damaged (cause `TABLES_DAMAGED`), or the database cannot be read.
     """
 
-    def __init__(self, files: FolderToRead, path: str) -> None:
-        self.files = files
+    def __init__(self, folder: FolderToRead, path: str) -> None:
+        self.folder = folder
         self.path = path
-        self.aside = asides(files)
+        self.aside = asides(folder)
         self._open()
 
     def _open(self) -> None:
         # without a log there is no daemon, and reading must not make one
-        self._is_alone = LOG not in self.files.names()
+        self._is_alone = LOG not in self.folder.names()
         with self._reading(self.path):
-            require_own_files(self.files)
+            require_own_files(self.folder)
             mode = "ro&immutable=1" if self._is_alone else "ro"
-            self._database: sqlite3.Connection = connect(self.files, mode=mode)
+            self._database: sqlite3.Connection = connect(self.folder, mode=mode)
             check_tables(self._database)
             record = read_record(self._database)
             self.map_id, self.settings = bytes.fromhex(record.map_id), record.settings
@@ -91,7 +91,7 @@ class StoredMap:
         try:
             return self._chunk(key)
         except MapDataError:
-            if not self._is_alone or LOG not in self.files.names():
+            if not self._is_alone or LOG not in self.folder.names():
                 raise
         self.close()
         self._open()  # a daemon has begun meanwhile
@@ -107,7 +107,7 @@ class StoredMap:
     def _reading(self, path: str) -> Iterator[None]:
         """Name the path in errors, and say what to do."""
         try:
-            with database_errors(self.files):
+            with database_errors(self.folder):
                 yield
         except OSError as error:
             raise MapDataError(
@@ -137,10 +137,11 @@ class StoredMap:
         self.close()
 
 
-def asides(files: FolderToRead) -> list[str]:
+def asides(folder: FolderToRead) -> list[str]:
     """Return the names of damaged databases that were put aside."""
     start = DATABASE + DAMAGED
-    return sorted(name for name in files.names() if name.startswith(start) and name[len(start) :].isdecimal())
+    names = (name for name in folder.names() if name.startswith(start))
+    return sorted(name for name in names if name[len(start) :].isdecimal())
 
 
 @contextlib.contextmanager

@@ -189,7 +189,7 @@ def test_a_scan_into_a_live_map(tmp_path: Path) -> None:
         opened = answer(messages.LiveOpen(1, "lidar", "front"))
         assert answer(scan(2)).scan == 2
         one = worker._maps["lidar"]
-        while waiting(len(one.live.chunks) < 27 or one.status().loading > 0):
+        while waiting(len(one.paged.chunks) < 27 or one.status().loading > 0):
             worker.run_turn()
         walker = Walker()
         second = scan(3)

@@ -12,7 +12,7 @@ import pytest
 
 from shmmap.live_worker.chunk_memory import ChunkMemory
 from shmmap.live_worker.disk.folder import Folder
-from shmmap.live_worker.disk.map_files import MapFiles
+from shmmap.live_worker.disk.map_database import MapDatabase
 from shmmap.live_worker.paged_map import PagedMap
 from tests.support.served_map import Served
 
@@ -21,10 +21,10 @@ from tests.support.served_map import Served
 def closed_maps(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Close what a test left open: maps, their memory and their directories."""
     opened: dict[int, Any] = {}
-    for kind in (PagedMap, MapFiles, ChunkMemory, Folder):
+    for kind in (PagedMap, MapDatabase, ChunkMemory, Folder):
         _follow(kind, opened, monkeypatch)
     yield
-    for one in sorted(opened.values(), key=lambda one: not isinstance(one, PagedMap | MapFiles)):
+    for one in sorted(opened.values(), key=lambda one: not isinstance(one, PagedMap | MapDatabase)):
         one.close()
 
 

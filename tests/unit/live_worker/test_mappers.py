@@ -11,7 +11,7 @@ import pytest
 from shmmap.chunks.layout import MAPPERS
 from shmmap.errors import BadRequest, Busy, LiveInterrupted
 from shmmap.live_worker.disk.folder import Folder
-from shmmap.live_worker.disk.map_files import SCANS_AHEAD, MapFiles
+from shmmap.live_worker.disk.map_database import SCANS_AHEAD, MapDatabase
 from shmmap.live_worker.disk.map_record import MapSettings
 from shmmap.live_worker.mappers import APPLIED_BYTES, AppliedScans, Mappers
 from tests.support.odd_files import failing
@@ -32,7 +32,7 @@ def memory() -> bytearray:
 
 @pytest.fixture
 def mappers(disk: Folder, memory: bytearray) -> Mappers:
-    return Mappers(MapFiles(disk, SETTINGS), AppliedScans(memory))
+    return Mappers(MapDatabase(disk, SETTINGS), AppliedScans(memory))
 
 
 def test_a_user_and_a_name_are_one_mapper(mappers: Mappers) -> None:
@@ -105,19 +105,19 @@ def test_the_next_run_knows_what_is_in_the_map(disk: Folder, memory: bytearray, 
         assert front.applied == then
     mappers.accepted(rear, 9)
     mappers.applied(rear, 9)
-    later = Mappers(MapFiles(disk, SETTINGS), AppliedScans(memory))
+    later = Mappers(MapDatabase(disk, SETTINGS), AppliedScans(memory))
     assert (later.open(1000, "front", 1).applied, later.open(1000, "rear", 2).applied) == (2, 9)
     assert later.open(1000, "new", 3).applied == 0
 
 
 def test_without_memory_the_record_says_what_is_in_the_map(disk: Folder, mappers: Mappers) -> None:
     front = mappers.open(1000, "front", 1)
-    files = MapFiles(disk, SETTINGS)
-    files.write_record({front.mapper.number: 7})
-    files.write_record(None)  # nothing new is known
-    assert MapFiles(disk, SETTINGS).applied == {front.mapper.number: 7}
+    database = MapDatabase(disk, SETTINGS)
+    database.write_record({front.mapper.number: 7})
+    database.write_record(None)  # nothing new is known
+    assert MapDatabase(disk, SETTINGS).applied == {front.mapper.number: 7}
     for record, applied in ((bytearray(APPLIED_BYTES), 7), (_noted(front.mapper.number, 12), 12)):
-        later = Mappers(MapFiles(disk, SETTINGS), AppliedScans(record))
+        later = Mappers(MapDatabase(disk, SETTINGS), AppliedScans(record))
         assert later.open(1000, "front", 1).applied == applied
 
 
@@ -143,7 +143,7 @@ def test_the_next_run_gives_numbers_that_no_scan_had(disk: Folder, mappers: Mapp
     front = mappers.open(1000, "front", 1)
     for scan in range(1, 8):
         mappers.expect(front.mapper.number, scan, 1).last = scan
-    later = Mappers(MapFiles(disk, SETTINGS), AppliedScans(bytearray(APPLIED_BYTES)))
+    later = Mappers(MapDatabase(disk, SETTINGS), AppliedScans(bytearray(APPLIED_BYTES)))
     active = later.open(1000, "front", 1)
     assert active.mapper.number == front.mapper.number
     first = later.next_scan(active)
@@ -171,7 +171,7 @@ def test_a_mapper_goes_on_while_the_disk_is_full(
         assert [one.mapper.name for one in mappers.by_number.values()] == ["front"]
     mappers.expect(number, 2 * SCANS_AHEAD, 1)
     rear = mappers.open(1000, "rear", 2)
-    found = MapFiles(disk, SETTINGS).mappers
+    found = MapDatabase(disk, SETTINGS).mappers
     assert [(one.number, one.name) for one in found] == [(number, "front"), (rear.mapper.number, "rear")]
     assert found[0].scans > 2 * SCANS_AHEAD
 
@@ -188,6 +188,6 @@ def test_a_mapper_that_cannot_be_forgotten_stays(
                 mappers.open(1000, "new", 1)
         assert len(mappers.by_number) == MAPPERS
     mappers.open(1000, "new", 1)
-    assert [one.name for one in MapFiles(disk, SETTINGS).mappers] == [
+    assert [one.name for one in MapDatabase(disk, SETTINGS).mappers] == [
         *(f"m{number}" for number in range(1, MAPPERS)), "new",
     ]  # fmt: skip

@@ -47,8 +47,8 @@ def served(serve: Callable[..., Served]) -> Served:
 
 def bring(served: Served, key: ChunkKey, generation: int = 1) -> None:
     """Put a new chunk into memory."""
-    content = new_header(served.live.identity(key, generation))
-    served.live.add_chunk(served.live.memory.create(content), 0.0)
+    content = new_header(served.paged.identity(key, generation))
+    served.paged.add_chunk(served.paged.memory.create(content), 0.0)
 
 
 def page(served: Served, **asked: object) -> LiveChunkPage:
@@ -62,8 +62,8 @@ def page(served: Served, **asked: object) -> LiveChunkPage:
 
 def on_disk(served: Served, key: ChunkKey, row: Row) -> None:
     """As if a chunk had a file."""
-    served.live.files.rows[key] = row
-    served.live.stored.add(key)
+    served.paged.database.rows[key] = row
+    served.paged.stored.add(key)
 
 
 def keys_of(found: LiveChunkPage) -> list[ChunkKey]:
@@ -101,8 +101,8 @@ def test_what_changed_and_what_left(served: Served) -> None:
     assert keys_of(page(served, since=everything.change)) == []
     for key in (b, a, b):
         served.map.changes.note_changed(key)
-    chunk = served.live.chunks.pop(c)
-    served.live.residency._forget(c)
+    chunk = served.paged.chunks.pop(c)
+    served.paged.residency._forget(c)
     served.map.changes.note_gone(c)
     later = page(served, since=everything.change)
     assert (keys_of(later), later.gone, later.since_known) == ([a, b], (c,), True)
@@ -112,7 +112,7 @@ def test_what_changed_and_what_left(served: Served) -> None:
     assert page(served, since=everything.change, area=elsewhere).gone == ()
     unknown = page(served, since=later.change + 5)
     assert (keys_of(unknown), unknown.gone, unknown.since_known) == ([a, b], (), False)
-    served.live.chunks[c] = chunk  # it is closed with the others
+    served.paged.chunks[c] = chunk  # it is closed with the others
 
 
 def test_the_longest_answer_is_shorter_than_a_packet_may_be(served: Served) -> None:
@@ -135,11 +135,11 @@ def test_the_longest_answer_is_shorter_than_a_packet_may_be(served: Served) -> N
 def test_chunks_that_are_being_loaded_are_listed(served: Served) -> None:
     """But not to a client that asks what changed: it cannot read them yet."""
     there, coming = ChunkKey(2, 0, 0), ChunkKey(3, 0, 0)
-    live = served.live
+    paged = served.paged
     bring(served, there, 2)
     before = served.map.changes.number
-    live.residency.add(Scan(1, 1, 10, {coming}))
-    assert live.residency.next_load(0.0) is not None
+    paged.residency.add(Scan(1, 1, 10, {coming}))
+    assert paged.residency.next_load(0.0) is not None
     found = {ChunkKey(*row.key): (row.state, row.generation, row.bytes) for row in page(served).rows}
     assert found == {there: ("clean", 2, HEADER_BYTES), coming: ("loading", 0, HEADER_BYTES)}
     assert not page(served, since=before).rows
@@ -165,12 +165,12 @@ def test_chunks_are_listed_while_others_are_saved(served: Served, monkeypatch: p
         on_disk(served, ChunkKey(x, 0, 0), row)
 
     def touch_and_save(_area: object, key: ChunkKey, _resolution: float) -> bool:
-        served.live.files.rows[ChunkKey(key.x, 50, 50)] = row
+        served.paged.database.rows[ChunkKey(key.x, 50, 50)] = row
         return True
 
     monkeypatch.setattr(readers, "touches", touch_and_save)
     assert keys_of(page(served, saved=True)) == [ChunkKey(x, 0, 0) for x in range(3)]
-    del served.live.files.rows[ChunkKey(1, 0, 0)]
+    del served.paged.database.rows[ChunkKey(1, 0, 0)]
     assert keys_of(page(served, saved=True)) == [ChunkKey(x, 0, 0) for x in (0, 2)], "one was quarantined"
 
 
@@ -258,7 +258,7 @@ def test_a_reader_of_a_slow_disk_keeps_no_other_waiting(served: Served, tmp_path
     def slow(_key: ChunkKey) -> None:
         goes_on.wait()
 
-    served.live.files.load = slow  # type: ignore[method-assign, assignment]
+    served.paged.database.load = slow  # type: ignore[method-assign, assignment]
     try:
         waits = [served.ask(lambda n: messages.LiveVoxels(n, "lidar", scope="disk")) for _ in range(3)]
         left = served.ask(lambda n: messages.LiveVoxels(n, "lidar", scope="disk"), session=3)
@@ -287,7 +287,7 @@ def test_the_end_waits_for_no_reader_s_files(served: Served) -> None:
         goes_on.wait()
         return None
 
-    served.live.files.load = slow  # type: ignore[method-assign]
+    served.paged.database.load = slow  # type: ignore[method-assign]
     try:
         for session in range(1, 9):
             served.ask(lambda n: messages.LiveVoxels(n, "lidar", scope="disk"), session)
@@ -346,13 +346,13 @@ def filled(serve: Callable[..., Served]) -> Served:
     """20 chunks in memory, of 256 occupied voxels each; lists may take a quarter of a million bytes."""
     one = serve(10**6)
     for key in KEYS:
-        file = one.live.memory.create(new_header(one.live.identity(key, 1)))
+        file = one.paged.memory.create(new_header(one.paged.identity(key, 1)))
         view = file.grow(1)
         view.bricks[0] = 100
         view.index[0] = 1
         view.state["bricks"] = view.state["version"] = 1
         view.state["active"] = view.state["occupied"] = VOXELS
-        one.live.add_chunk(file, 0.0)
+        one.paged.add_chunk(file, 0.0)
     return one
 
 
@@ -482,7 +482,7 @@ def test_lists_that_are_being_made_count_as_well(lists: VoxelLists) -> None:
 
 def test_a_list_waits_until_chunks_have_made_room(filled: Served, lists: VoxelLists) -> None:
     """And takes no byte before: it is within the budget as they are."""
-    residency = filled.live.residency
+    residency = filled.paged.residency
     residency.beside_bytes = residency.limits.budget_bytes - residency.chunk_bytes
     steps = lists.collect(LiveVoxels(1, "lidar"), iter([KEYS[:1]]), 1, 0)
     while not isinstance(next(steps), Later):
@@ -514,7 +514,7 @@ def test_a_list_is_cut_when_it_was_read_or_was_there_for_long(lists: VoxelLists,
             lists.on_disconnect(1)
         assert os.fstat(file.fileno()).st_blocks == 0
         assert file.read() == b""
-    assert (lists.nbytes, lists.live.residency.beside_bytes, names(shm)) == (0, 0, [])
+    assert (lists.nbytes, lists.paged.residency.beside_bytes, names(shm)) == (0, 0, [])
     assert lists.next_expiry_s == math.inf
 
 
@@ -547,7 +547,7 @@ def test_lists_of_an_previous_run_are_removed(lists: VoxelLists, shm: Path) -> N
     name = collect(lists, KEYS[:1]).segment[1:]
     other = name.replace(".lidar.", ".radar.")
     (shm / other).touch()
-    VoxelLists(lists.live).remove_all()
+    VoxelLists(lists.paged).remove_all()
     assert names(shm) == [other]
     (shm / other).unlink()
 
@@ -558,15 +558,15 @@ def test_the_disk_is_read_in_threads(filled: Served, lists: VoxelLists, scope: s
     filled.until(lambda: filled.map.is_saved, save_all=True)
     if scope == "all":
         for key in KEYS[5:]:
-            del filled.live.residency.chunks[key]
-            filled.live.memory.give_up(filled.live.chunks.pop(key))
-    load, where = filled.live.files.load, []
+            del filled.paged.residency.chunks[key]
+            filled.paged.memory.give_up(filled.paged.chunks.pop(key))
+    load, where = filled.paged.database.load, []
 
     def noted(key: ChunkKey, generation: int = 0) -> bytearray | None:
         where.append(threading.get_ident())
         return load(key, generation)
 
-    filled.live.files.load = noted  # type: ignore[method-assign]
+    filled.paged.database.load = noted  # type: ignore[method-assign]
     ticket = filled.ask(lambda n: LiveVoxels(n, "lidar", scope=scope))
     reply = filled.answer(ticket)
     assert reply.count == VOXELS * len(KEYS)
@@ -576,7 +576,7 @@ def test_the_disk_is_read_in_threads(filled: Served, lists: VoxelLists, scope: s
 
 def test_a_file_that_cannot_be_read_is_an_error_of_the_one_request(filled: Served) -> None:
     filled.until(lambda: filled.map.is_saved, save_all=True)
-    filled.live.files.load = failing(errno.EIO)  # type: ignore[method-assign]
+    filled.paged.database.load = failing(errno.EIO)  # type: ignore[method-assign]
     failed = filled.answer(filled.ask(lambda n: LiveVoxels(n, "lidar", scope="disk")))
     assert (failed.code, "Input/output error" in failed.message) == ("bad_map_data", True)
     assert filled.answer(filled.ask(lambda n: LiveVoxels(n, "lidar"))).count == VOXELS * len(KEYS)

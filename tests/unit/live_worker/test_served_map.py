@@ -87,7 +87,7 @@ def test_a_scan_that_waits_for_room_is_answered_why(
     scans = marked(12)
     one = serve(96 << 10, waiting_bytes=1, linger_s=0.0)
     mapper, number = one.open().mapper, 0
-    owner, name = (one.live.files, "save") if full == "disk" else (one.live.memory, "create")
+    owner, name = (one.paged.database, "save") if full == "disk" else (one.paged.memory, "create")
     with monkeypatch.context() as patch:
         fail(patch, owner, name, errno.ENOSPC)
         refused: dict[int, ErrorReply] = {}
@@ -110,9 +110,9 @@ def test_a_scan_that_waits_for_room_is_answered_why(
         assert one.answer(waits).scan == scan
     one.end()
     again = serve()
-    for key in again.live.files.rows:
-        again.live.move(key, tuple((index + 0.5) * 64 * RESOLUTION for index in key))  # type: ignore[arg-type]
-    again.until(lambda: set(again.live.chunks) >= set(again.live.files.rows))
+    for key in again.paged.database.rows:
+        again.paged.move(key, tuple((index + 0.5) * 64 * RESOLUTION for index in key))  # type: ignore[arg-type]
+    again.until(lambda: set(again.paged.chunks) >= set(again.paged.database.rows))
     assert again.voxels() == reference(*scans[: number + 1])
 
 
@@ -136,7 +136,7 @@ def test_a_running_scan_is_answered_to_the_session_that_sends_it_again(
 ) -> None:
     """Its mapper lost the connection, and came back as another session."""
     one = serve(**LATER)
-    blocked = Blocked(monkeypatch, one.live.files, "load")
+    blocked = Blocked(monkeypatch, one.paged.database, "load")
     (marks,) = marked(1)
     opened = one.open(session=1)
     first = one.send(marks, opened.mapper, 1, session=1)
@@ -155,7 +155,7 @@ def test_a_running_scan_is_answered_to_the_session_that_sends_it_again(
 
 def test_what_waits_when_a_session_ends_is_not_applied(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
     one = serve(waiting_bytes=1, **LATER)
-    blocked = Blocked(monkeypatch, one.live.files, "load")
+    blocked = Blocked(monkeypatch, one.paged.database, "load")
     first, second = marked(2)
     opened = one.open()
     one.send(first, opened.mapper, 1)
@@ -175,7 +175,7 @@ def test_what_waits_when_another_session_takes_the_mapper_is_refused(
 ) -> None:
     """Another program of the same name: it numbers its scans from there on."""
     one = serve(waiting_bytes=1, **LATER)
-    blocked = Blocked(monkeypatch, one.live.files, "load")
+    blocked = Blocked(monkeypatch, one.paged.database, "load")
     first, second = marked(2)
     mapper = one.open(session=1).mapper
     one.send(first, mapper, 1, session=1)
@@ -193,7 +193,7 @@ def test_what_waits_when_another_session_takes_the_mapper_is_refused(
 def test_tickets_of_a_scan_do_not_pile_up(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
     """Sessions come, resend a scan that waits for its chunks, and go."""
     one = serve(**LATER)
-    blocked = Blocked(monkeypatch, one.live.files, "load")
+    blocked = Blocked(monkeypatch, one.paged.database, "load")
     (marks,) = marked(1)
     mapper = one.open().mapper
     for session in range(1, 6):
@@ -254,8 +254,8 @@ def test_what_was_all_but_given_up_comes_back_from_disk(
     one.answer(one.send(marks, one.open().mapper, 1))
     one.until(lambda: one.map.is_saved, save_all=True)
     key = marks.chunks[0]
-    gone = shm / one.live.chunks[key].name[1:]
-    one.live.chunks[key].view.state["state"] = OUT_OF_SERVICE
+    gone = shm / one.paged.chunks[key].name[1:]
+    one.paged.chunks[key].view.state["state"] = OUT_OF_SERVICE
     one.end(keep=True)
     left = sorted(shm.glob("*_*"))
     with monkeypatch.context() as patch:
@@ -264,7 +264,7 @@ def test_what_was_all_but_given_up_comes_back_from_disk(
             serve(**LATER)
     assert sorted(shm.glob("*_*")) == left
     one = serve(**LATER)
-    assert key not in one.live.chunks
+    assert key not in one.paged.chunks
     assert not gone.exists()
     one.answer(one.send(marks, one.open().mapper, 1))
     assert one.voxels() == reference(marks)
@@ -337,10 +337,10 @@ def test_saved_means_that_what_was_given_up_is_on_the_disk_too(
     one = serve(linger_s=0.0, checkpoint_s=1e9, most_active=1)
     (marks,) = marked(1)
     mapper = one.open().mapper
-    blocked = Blocked(monkeypatch, one.live.files, "flush")
+    blocked = Blocked(monkeypatch, one.paged.database, "flush")
     one.answer(one.send(marks, mapper, 1))
     one.ask(lambda n: messages.LiveMove(n, "lidar", (5e4, 0.0, 0.0)))
-    one.until(lambda: blocked.calls and not set(marks.chunks) & set(one.live.chunks))
+    one.until(lambda: blocked.calls and not set(marks.chunks) & set(one.paged.chunks))
     ticket = one.ask(lambda n: messages.LiveSave(n, "lidar"))
     for _ in range(5):
         one.turn()
@@ -370,21 +370,21 @@ def test_a_disk_that_is_full_stops_no_mapper(serve: Serve, monkeypatch: pytest.M
     scans = marked(5)  # the last one is far away from the others
     mapper = one.open().mapper
     with monkeypatch.context() as patch:
-        calls = fail(patch, one.live.files, "save", errno.ENOSPC)
+        calls = fail(patch, one.paged.database, "save", errno.ENOSPC)
         for number, marks in enumerate(scans, 1):
             one.answer(one.send(marks, mapper, number))
         start_s = one.now_s
         for _ in range(50):
             one.turn()
-            one.live.wait(0.01)
-        assert len(calls) <= one.live.limits.saves * (one.now_s - start_s + 2.0), (
+            one.paged.wait(0.01)
+        assert len(calls) <= one.paged.limits.saves * (one.now_s - start_s + 2.0), (
             "a bounded number each second"
         )
         status = one.map.status()
         assert "cannot be saved: No space left" in status.problem
         assert one.voxels() == reference(*scans)
         assert status.dirty
-        assert {key for marks in scans for key in marks.chunks} <= set(one.live.chunks)
+        assert {key for marks in scans for key in marks.chunks} <= set(one.paged.chunks)
     one.until(lambda: one.map.is_saved, save_all=True)
     assert one.map.status().problem == ""
 
@@ -392,7 +392,7 @@ def test_a_disk_that_is_full_stops_no_mapper(serve: Serve, monkeypatch: pytest.M
 def test_a_new_mapper_needs_the_disk(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
     one = serve()
     with monkeypatch.context() as patch:
-        fail(patch, one.live.files, "_write_map", errno.ENOSPC)
+        fail(patch, one.paged.database, "_write_map", errno.ENOSPC)
         refused = one.answer(one.ask(lambda n: messages.LiveOpen(n, "lidar", "front")))
         assert (refused.code, "cannot be written: No space left" in refused.message) == (
             CannotWrite.code,
@@ -409,13 +409,13 @@ def test_a_directory_that_cannot_be_flushed_is_tried_again_later(
     mapper = one.open().mapper
     one.answer(one.send(marks, mapper, 1))
     with monkeypatch.context() as patch:
-        calls = fail(patch, one.live.files, "flush", errno.EIO)
+        calls = fail(patch, one.paged.database, "flush", errno.EIO)
         ticket = one.ask(lambda n: messages.LiveSave(n, "lidar"))
         one.until(lambda: calls)
         start_s = one.now_s
         for _ in range(30):
             one.turn()
-            one.live.wait(0.01)
+            one.paged.wait(0.01)
         assert len(calls) <= 2 + (one.now_s - start_s), "once a second"
         assert "not flushed: Input/output" in one.map.status().problem
         assert ticket not in one.answers
@@ -428,7 +428,7 @@ def test_the_record_is_written_once_a_minute(serve: Serve, monkeypatch: pytest.M
     one = serve(**LATER)
     mapper = one.open().mapper
     times_s: list[float] = []
-    monkeypatch.setattr(one.live, "write_record", lambda _: times_s.append(one.now_s))
+    monkeypatch.setattr(one.paged, "write_record", lambda _: times_s.append(one.now_s))
     scans = marked(10)
     for number, marks in enumerate(scans, 1):
         one.answer(one.send(marks, mapper, number))
@@ -443,7 +443,7 @@ def test_the_record_is_written_once_a_minute(serve: Serve, monkeypatch: pytest.M
 
 def test_while_a_chunk_is_loaded_nothing_turns(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
     one = serve(**LATER)
-    blocked = Blocked(monkeypatch, one.live.files, "load")
+    blocked = Blocked(monkeypatch, one.paged.database, "load")
     (marks,) = marked(1)
     one.send(marks, one.open().mapper, 1)
     for _ in range(3):
@@ -456,7 +456,7 @@ def test_while_a_chunk_is_loaded_nothing_turns(serve: Serve, monkeypatch: pytest
 def test_while_files_are_written_nothing_turns(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
     """Although more of them are due."""
     one = serve(linger_s=1e9, checkpoint_s=0.1, saves=1)
-    blocked = Blocked(monkeypatch, one.live.files, "save")
+    blocked = Blocked(monkeypatch, one.paged.database, "save")
     (marks,) = marked(1)
     assert len(marks.chunks) > 2
     one.answer(one.send(marks, one.open().mapper, 1))

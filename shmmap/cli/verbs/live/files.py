@@ -225,7 +225,7 @@ def _run_export(args: argparse.Namespace) -> int:
 
     path = _directory_from(args)
     began_s = time.monotonic()
-    with opened_folder_to_read(path) as files, StoredMap(files, path) as stored:
+    with opened_folder_to_read(path) as folder, StoredMap(folder, path) as stored:
         made = export(
             stored,
             args.output,

@@ -18,7 +18,7 @@ from shmmap.errors import MapDataError
 from shmmap.formats.cloud import read_cloud
 from shmmap.live_worker.disk.exporting import ExportedVoxels, Format, Voxels, export
 from shmmap.live_worker.disk.folder import Folder
-from shmmap.live_worker.disk.map_files import MapFiles
+from shmmap.live_worker.disk.map_database import MapDatabase
 from shmmap.live_worker.disk.map_record import MapSettings
 from shmmap.live_worker.disk.stored_map import StoredMap, opened_folder_to_read
 from tests.support.divided_map import read_pcd
@@ -39,7 +39,7 @@ def exported(
     translate: Translation = "auto",
     force: bool = False,
 ) -> ExportedVoxels | None:
-    with opened_folder_to_read(str(directory)) as files, StoredMap(files, str(directory)) as stored:
+    with opened_folder_to_read(str(directory)) as folder, StoredMap(folder, str(directory)) as stored:
         return export(
             stored, place(directory, kind), kind, voxels=voxels,
             translate=translate, force=force,
@@ -158,8 +158,8 @@ def test_a_damaged_chunk_ends_it(directory: Path, kind: Format) -> None:
         exported(directory, kind, "both")
     assert "live fsck" in caught.value.hint
     assert contents(directory.parent.parent).keys() == {f"live/lidar/{name}" for name in contents(directory)}
-    with closing(Folder(directory)) as folder, closing(MapFiles(folder, SETTINGS)) as files:
-        assert files.load(key) is None  # as a daemon that finds it
+    with closing(Folder(directory)) as folder, closing(MapDatabase(folder, SETTINGS)) as database:
+        assert database.load(key) is None  # as a daemon that finds it
     made = exported(directory, kind, "both")
     assert made is not None
     assert made.lost == [key.text]

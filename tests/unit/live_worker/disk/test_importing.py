@@ -14,7 +14,7 @@ from shmmap.chunks.chunk_file import read_file_header
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.errors import ConfigError, MapDataError
 from shmmap.live_worker.disk.folder import Folder
-from shmmap.live_worker.disk.map_files import MapFiles
+from shmmap.live_worker.disk.map_database import MapDatabase
 from shmmap.live_worker.disk.map_record import MapSettings
 from tests.support import live_reference
 from tests.support.live_drive import SETTINGS
@@ -24,10 +24,10 @@ from tests.support.stored_chunks import files_of, saved_bytes
 
 
 @contextmanager
-def opened(directory: Path, settings: MapSettings = SETTINGS) -> Iterator[MapFiles]:
+def opened(directory: Path, settings: MapSettings = SETTINGS) -> Iterator[MapDatabase]:
     """Open a map as a daemon does."""
-    with closing(Folder(directory)) as folder, closing(MapFiles(folder, settings)) as files:
-        yield files
+    with closing(Folder(directory)) as folder, closing(MapDatabase(folder, settings)) as database:
+        yield database
 
 
 @pytest.fixture
@@ -43,17 +43,17 @@ def chunks_of(directory: Path) -> dict[ChunkKey, bytes]:
 def test_all_of_it_is_imported_and_kept(old: Path) -> None:
     before, chunks = contents(old), chunks_of(old)
     assert len(chunks) > 5
-    with opened(old) as files:
-        assert files.rows.keys() == chunks.keys()
+    with opened(old) as database:
+        assert database.rows.keys() == chunks.keys()
         assert {key: saved_bytes(old, key) for key in chunks} == chunks
-        assert all(files.load(key) for key in chunks)
-        assert (files.lost, files.applied) == ({}, {1: 2})
-        assert [(one.number, one.uid, one.name, one.scans) for one in files.mappers] == [
+        assert all(database.load(key) for key in chunks)
+        assert (database.lost, database.applied) == ({}, {1: 2})
+        assert [(one.number, one.uid, one.name, one.scans) for one in database.mappers] == [
             (1, 1000, "front", 1 << 20)
         ]
-        assert files.map_id == bytes(range(16))
-        assert files.begin_run() == 4
-        assert files.add_mapper(1000, "rear").number == 2
+        assert database.map_id == bytes(range(16))
+        assert database.begin_run() == 4
+        assert database.add_mapper(1000, "rear").number == 2
     assert files_of(old) == {"map.db", "map.json", "imported.1"}
     assert contents(old / "imported.1") == before, "what was there is as it was"
     with opened(old) as again:
@@ -70,8 +70,8 @@ def test_what_has_the_name_already_stays(old: Path, kind: str) -> None:
         there.mkdir()
         there /= next(name for name in before if name.endswith(".chunk"))
     there.write_bytes(b"precious")
-    with opened(old) as files:
-        assert not files.lost
+    with opened(old) as database:
+        assert not database.lost
     assert there.read_bytes() == b"precious"
     assert contents(old / "imported.2") == before
 
@@ -87,11 +87,11 @@ def test_the_newest_good_one_of_each_chunk_counts(old: Path) -> None:
     (old / f"{first.text}.chunk").unlink()
     (old / f"{second.text}.chunk").write_bytes(newer[:100])
     (old / f"{third.text}.chunk").write_bytes(other[:-1])
-    with opened(old) as files:
+    with opened(old) as database:
         assert saved_bytes(old, first) == data
         assert saved_bytes(old, second) == newer
-        assert (list(files.lost), files.rows.get(third)) == ([third], None)
-        assert files.lost[third].version == read_file_header(other).version
+        assert (list(database.lost), database.rows.get(third)) == ([third], None)
+        assert database.lost[third].version == read_file_header(other).version
 
 
 def gone(path: Path, _other: Path) -> None:
@@ -115,10 +115,10 @@ def test_what_was_lost_has_its_name(old: Path, damage: Callable[[Path, Path], No
     if not manifest:
         (old / "manifest.json").unlink()
     lost = {ChunkKey.from_text(path.stem)} if manifest or damage is not gone else set()
-    with opened(old) as files:
-        files.begin_run()
-        assert files.lost.keys() == lost
-        assert files.rows.keys() == chunks.keys() - {ChunkKey.from_text(path.stem)}
+    with opened(old) as database:
+        database.begin_run()
+        assert database.lost.keys() == lost
+        assert database.rows.keys() == chunks.keys() - {ChunkKey.from_text(path.stem)}
     with opened(old) as again:
         assert again.lost.keys() == lost
 
@@ -128,8 +128,8 @@ def test_what_was_lost_before_is_lost(old: Path) -> None:
     key = next(iter(manifest["chunks"]))
     manifest["missing"] = {key: {**manifest["chunks"][key], "version": 900}}
     (old / "manifest.json").write_text(json.dumps(manifest))
-    with opened(old) as files:
-        assert {one.text: lost.version for one, lost in files.lost.items()} == {key: 900}
+    with opened(old) as database:
+        assert {one.text: lost.version for one, lost in database.lost.items()} == {key: 900}
 
 
 @pytest.mark.parametrize("text", [b"{", b"[" * 200_000, b"\xff", b""])
@@ -140,8 +140,8 @@ def test_a_damaged_manifest_and_a_damaged_record(old: Path, text: bytes) -> None
         pass
     (old / "map.json").write_bytes(before["map.json"])
     (old / "manifest.json").write_bytes(text)
-    with opened(old) as files:
-        assert len(files.rows) == len(chunks_of(old / "imported.1"))
+    with opened(old) as database:
+        assert len(database.rows) == len(chunks_of(old / "imported.1"))
     assert (old / "imported.1" / "manifest.json").read_bytes() == text
 
 
@@ -209,17 +209,17 @@ def test_killed_at_any_step_it_is_imported_by_the_next_start(
         folder = Watched(directory)
         ended = False
         try:
-            with closing(MapFiles(folder, SETTINGS)) as files:
-                files.begin_run()
+            with closing(MapDatabase(folder, SETTINGS)) as database:
+                database.begin_run()
             ended = True
         except Killed:
             pass
         finally:
             folder.close()
-        with opened(directory) as files:
-            files.begin_run()
-            assert files.rows.keys() == chunks.keys()
-            assert not files.lost
+        with opened(directory) as database:
+            database.begin_run()
+            assert database.rows.keys() == chunks.keys()
+            assert not database.lost
             assert {key: saved_bytes(directory, key) for key in chunks} == chunks
         assert contents(directory / "imported.1") == before
         assert files_of(directory) == {"map.db", "map.json", "imported.1"}

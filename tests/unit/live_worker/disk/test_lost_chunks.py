@@ -115,12 +115,12 @@ class Damaged:
             folder.close()
 
     def exported(self) -> ExportedVoxels | None:
-        files = FolderToRead(self.directory)
+        folder = FolderToRead(self.directory)
         try:
-            with StoredMap(files, str(self.directory)) as stored:
+            with StoredMap(folder, str(self.directory)) as stored:
                 return export(stored, self.shm / "out.ply", "ply", voxels="both", force=True)
         finally:
-            files.close()
+            folder.close()
 
     def all_say_so(self, served: Served) -> None:
         """Each answer, the state of the map, the check of the files, and the export."""
@@ -173,13 +173,13 @@ def test_what_is_lost_is_named_by_all_until_it_is_forgotten(
         served = damaged.serve()
     if noticed == "loading":
         for key in damaged.lost:
-            served.live.move("client", tuple((index + 0.5) * 64 * RESOLUTION for index in key))  # type: ignore[arg-type]
-            served.until(lambda key=key: key in served.live.chunks)  # type: ignore[misc]
+            served.paged.move("client", tuple((index + 0.5) * 64 * RESOLUTION for index in key))  # type: ignore[arg-type]
+            served.until(lambda key=key: key in served.paged.chunks)  # type: ignore[misc]
     else:
         lacking, found = damaged.answer(served, noticed)
         assert (lacking, found) == (damaged.lost, damaged.left)
-    served.until(lambda: not served.live.files.record_is_due)
-    served.until(lambda: served.live._threads.are_idle)
+    served.until(lambda: not served.paged.database.record_is_due)
+    served.until(lambda: served.paged._threads.are_idle)
     damaged.all_say_so(served)
     served.end(keep=True)  # as after a kill
     served = damaged.serve()
@@ -196,8 +196,8 @@ def test_what_is_lost_is_named_by_all_until_it_is_forgotten(
 def test_what_memory_has_is_saved_again(damaged: Damaged, name: str, dies: bool) -> None:
     """The list from the disk lacks it just once; also if the worker dies before it is saved."""
     served = damaged.serve()
-    served.live.move("client", tuple((index + 0.5) * 64 * RESOLUTION for index in damaged.key))  # type: ignore[arg-type]
-    served.until(lambda: damaged.key in served.live.chunks)
+    served.paged.move("client", tuple((index + 0.5) * 64 * RESOLUTION for index in damaged.key))  # type: ignore[arg-type]
+    served.until(lambda: damaged.key in served.paged.chunks)
     damaged.damage(name)
     assert damaged.answer(served, "all") == (set(), damaged.voxels)
     ticket = served.ask(lambda n: LiveVoxels(n, "lidar", scope="disk"))
@@ -218,8 +218,8 @@ def test_a_chunk_that_is_lost_twice(damaged: Damaged) -> None:
     damaged.damage("empty")
     mapper = served.open().mapper
     place = tuple((index + 0.5) * 64 * RESOLUTION for index in damaged.key)
-    served.live.move("client", place)  # type: ignore[arg-type]
-    served.until(lambda: damaged.key in served.live.chunks)
+    served.paged.move("client", place)  # type: ignore[arg-type]
+    served.until(lambda: damaged.key in served.paged.chunks)
     (marks,) = (one for one in marked(3)[2:])
     assert damaged.key in marks.chunks
     served.answer(served.send(marks, mapper, 1, at=place[0]))
@@ -241,7 +241,7 @@ def test_a_disk_that_cannot_be_read_at_present_is_a_problem_until_it_can(
     """What it has may be good: nothing is lost, and nothing is answered without it."""
     served = damaged.serve()
     with monkeypatch.context() as patch:
-        patch.setattr(served.live.files, "_read", failing(errno.EIO))
+        patch.setattr(served.paged.database, "_read", failing(errno.EIO))
         for scope in ("disk", "all"):
             refused = served.answer(served.ask(lambda n, scope=scope: LiveVoxels(n, "lidar", scope=scope)))  # type: ignore[misc]
             assert isinstance(refused, ErrorReply)
@@ -256,16 +256,16 @@ def test_tables_that_are_damaged_while_all_of_it_is_in_memory(damaged: Damaged) 
     """A new database is made beside the old one; what was lost from it is saved again."""
     served = damaged.serve()
     for key in chunk_sizes(damaged.directory):
-        served.live.move(key, tuple((index + 0.5) * 64 * RESOLUTION for index in key))  # type: ignore[arg-type]
-    served.until(lambda: set(served.live.chunks) >= set(served.live.files.rows))
+        served.paged.move(key, tuple((index + 0.5) * 64 * RESOLUTION for index in key))  # type: ignore[arg-type]
+    served.until(lambda: set(served.paged.chunks) >= set(served.paged.database.rows))
     for number, kind in page_kinds(damaged.directory).items():
         if kind != "other":
             damage_page(damaged.directory, number, bytes(PAGE))
-    for connection in (served.live.files._reader, served.live.files._writer):
+    for connection in (served.paged.database._reader, served.paged.database._writer):
         assert connection is not None
         connection.execute("pragma shrink_memory")  # else what was read before is not read again
     damaged.answer(served, "disk")
-    served.until(lambda: served.map.is_saved and not served.live.files.lost, save_all=True)
+    served.until(lambda: served.map.is_saved and not served.paged.database.lost, save_all=True)
     assert damaged.answer(served, "disk") == damaged.answer(served, "all") == (set(), damaged.voxels)
     served.end()
     assert damaged.checked().good

@@ -16,7 +16,7 @@ from shmmap.chunks.voxels import ChunkKey
 from shmmap.errors import MapDataError
 from shmmap.live_worker.disk.folder import Folder, FolderToRead
 from shmmap.live_worker.disk.maintenance import CheckedMap, check, repair, reset
-from shmmap.live_worker.disk.map_files import MapFiles
+from shmmap.live_worker.disk.map_database import MapDatabase
 from shmmap.live_worker.disk.stored_map import StoredMap, opened_folder, opened_folder_to_read
 from tests.support.live_drive import SETTINGS
 from tests.support.live_reference import contents, stored_drive
@@ -25,8 +25,8 @@ from tests.support.stored_chunks import change_chunk, chunk_sizes, largest, save
 
 def checked_as_it_is(directory: Path) -> CheckedMap:
     """Check a map as everybody may."""
-    with opened_folder_to_read(str(directory)) as files:
-        return check(files, str(directory))
+    with opened_folder_to_read(str(directory)) as folder:
+        return check(folder, str(directory))
 
 
 def checked(directory: Path) -> CheckedMap:
@@ -73,9 +73,9 @@ def assert_found_and_put_aside(directory: Path, key: ChunkKey, damaged: bytes) -
     assert again.good
     assert key not in again.rows
     assert found.rebuilt_from in again.aside
-    with closing(Folder(directory)) as folder, closing(MapFiles(folder, SETTINGS)) as files:
-        assert files.rows == again.rows
-        assert not files.lost
+    with closing(Folder(directory)) as folder, closing(MapDatabase(folder, SETTINGS)) as database:
+        assert database.rows == again.rows
+        assert not database.lost
 
 
 def test_a_chunk_that_contradicts_itself(tmp_path: Path) -> None:
@@ -100,15 +100,15 @@ def test_a_chunk_of_another_map(tmp_path: Path) -> None:
 def test_while_a_daemon_works_with_it(tmp_path: Path) -> None:
     """What is committed is read, and nothing is waited for; a check has no part in the daemon's locks."""
     stored_drive(tmp_path)
-    with closing(Folder(tmp_path)) as folder, closing(MapFiles(folder, SETTINGS)) as files:
+    with closing(Folder(tmp_path)) as folder, closing(MapDatabase(folder, SETTINGS)) as database:
         key = largest(tmp_path)
-        view = ChunkView(new_header(SETTINGS.identity(files.map_id, key, 1)))
+        view = ChunkView(new_header(SETTINGS.identity(database.map_id, key, 1)))
         for version in range(100, 103):
             view.state["version"] = version
-            files.save(key, encode_chunk(view, "raw"))
+            database.save(key, encode_chunk(view, "raw"))
             found = check_in_another_process(tmp_path)
-            assert f"{len(files.rows)} chunks" in found
-        files.finish()
+            assert f"{len(database.rows)} chunks" in found
+        database.finish()
         assert (tmp_path / "map.db-wal").stat().st_size == 0
         assert "good" in check_in_another_process(tmp_path)
 
@@ -123,13 +123,13 @@ def test_a_daemon_that_begins_while_the_map_is_read(tmp_path: Path) -> None:
     stored_drive(tmp_path)
     with closing(FolderToRead(tmp_path)) as folder, StoredMap(folder, str(tmp_path)) as stored:
         assert contents(tmp_path).keys() == {"map.db", "map.json"}, "reading makes no log"
-        with closing(Folder(tmp_path)) as locked, closing(MapFiles(locked, SETTINGS)) as files:
+        with closing(Folder(tmp_path)) as locked, closing(MapDatabase(locked, SETTINGS)) as database:
             for version in range(2000, 2100):
-                for key in files.rows:
-                    view = ChunkView(new_header(SETTINGS.identity(files.map_id, key, 1)))
+                for key in database.rows:
+                    view = ChunkView(new_header(SETTINGS.identity(database.map_id, key, 1)))
                     view.state["version"] = version
-                    files.save(key, encode_chunk(view, "raw"))
-            files.finish()
+                    database.save(key, encode_chunk(view, "raw"))
+            database.finish()
             for key in stored.rows:
                 assert stored.chunk(key) is not None
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A live map on disk: its record, and a row for each of its chunks, in one SQLite database.
 
-A commit is in the kernel when `MapFiles.save` returns, so no death of a process loses it, and the chunk's
-memory may be freed.  `MapFiles.flush` flushes the database's log: all commits before are *durable*.  When
+A commit is in the kernel when `MapDatabase.save` returns, so no death of a process loses it, and the chunk's
+memory may be freed.  `MapDatabase.flush` flushes the database's log: all commits before are *durable*.  When
 the log has become long, it is brought into the database.
 
 One connection writes and brings the log in; a second one only reads, beside it.  Nothing else in the process
@@ -76,13 +76,13 @@ MAX_LOG_BYTES: Final = 64 << 20
 _LOOKED_AT: Final = 16
 
 
-class MapFiles:
+class MapDatabase:
     """The database of one live map.  Usable from any thread.
 
     Parameters
     ----------
-    files
-        Files of the map's own directory.
+    folder
+        The map's own directory.
     settings
         Settings of a new map; an existing map must have the same.
 
@@ -114,8 +114,8 @@ class MapFiles:
         A file cannot be read or written.
     """
 
-    def __init__(self, files: Folder, settings: MapSettings) -> None:
-        self.files = files
+    def __init__(self, folder: Folder, settings: MapSettings) -> None:
+        self.folder = folder
         self.rows: dict[ChunkKey, Row] = {}
         self.lost: dict[ChunkKey, Lost] = {}
         self.found_lost: deque[ChunkKey] = deque()
@@ -135,10 +135,10 @@ class MapFiles:
         self._is_closed = self._begun = self._flush_failed = False
         self.record: MapRecord
         self._has_record = False
-        require_local_disk(files)
+        require_local_disk(folder)
         try:
             self._make_if_missing(settings)
-            put_old_files_aside(files)
+            put_old_files_aside(folder)
             self._open_or_rebuild()
             _check_settings(self.record.settings, settings)
         except BaseException:
@@ -149,20 +149,20 @@ class MapFiles:
 
     def _make_if_missing(self, settings: MapSettings) -> None:
         """Make a database if there is none: for a new map, or from an old directory."""
-        files, names = self.files, set(self.files.names())
-        require_own_files(files)
+        folder, names = self.folder, set(self.folder.names())
+        require_own_files(folder)
         with named(MAP_FILE):
-            files.require_regular(MAP_FILE)
+            folder.require_regular(MAP_FILE)
         for name in names:
             if name.startswith(f".{MAP_FILE}.") and name.endswith(INTERIM):
-                files.remove(name)
-        if DATABASE in names or finish_replacing(files):
+                folder.remove(name)
+        if DATABASE in names or finish_replacing(folder):
             return
         record = MapRecord(MAP_FORMAT, secrets.token_hex(16), settings)
         chunks: Chunks = iter(())
         if MAP_FILE in names:
             with named(MAP_FILE):
-                record = read_map(files)
+                record = read_map(folder)
             if record.format != OLD_FORMAT:
                 raise MapDataError(
                     f"{MAP_FILE} is there, but the database with the chunks is missing",
@@ -170,16 +170,16 @@ class MapFiles:
                     hint="bring the file back from a copy; or have `shmmap live reset` put the rest aside",
                 )
             _check_settings(record.settings, settings)
-            log.info("live map of an earlier version is imported", path=files.path)
-            chunks = read_old_chunks(files, record)
+            log.info("live map of an earlier version is imported", path=folder.path)
+            chunks = read_old_chunks(folder, record)
         elif OldFiles.of(names).all:
             raise MapDataError(
                 "there are chunks, or a list of them, but the file that says what they are is missing",
                 path=MAP_FILE,
                 hint="choose another directory, or bring the file back",
             )
-        make_database(files, record, chunks)
-        put_in_place(files)
+        make_database(folder, record, chunks)
+        put_in_place(folder)
 
     def _open_or_rebuild(self) -> None:
         with self._writing:
@@ -199,21 +199,21 @@ class MapFiles:
             raise
 
     def _connect(self) -> None:
-        with self._reading, database_errors(self.files):
-            self._writer = connect(self.files)
+        with self._reading, database_errors(self.folder):
+            self._writer = connect(self.folder)
             check_tables(self._writer)
-            require_log(self._writer, self.files)
+            require_log(self._writer, self.folder)
             for pragma in ("synchronous = normal", "wal_autocheckpoint = 0", "cell_size_check = on"):
                 self._writer.execute(f"pragma {pragma}")
             text = self._writer.execute("select record from map").fetchall()
             self._writer.execute("replace into map values(0, ?)", text[0] if text else ("",))  # makes the log
-            self._reader = connect(self.files, mode="ro")
+            self._reader = connect(self.folder, mode="ro")
             if not self._has_record:
                 self.record, self._has_record = read_record(self._reader), True
             rows, numbers, last = read_rows(self._reader, self.record)
-        self._log = os.open(self.files.place(LOG), os.O_RDONLY | os.O_CLOEXEC)
+        self._log = os.open(self.folder.place(LOG), os.O_RDONLY | os.O_CLOEXEC)
         os.fdatasync(self._log)
-        self.files.sync_names()
+        self.folder.sync_names()
         with self._changing:
             self.rows, self._numbers, self._next_number = rows, numbers, last + 1
             self.lost = self.record.lost_chunks
@@ -237,9 +237,9 @@ class MapFiles:
             before, lost = dict(self.rows), dict(self.lost)
             if self._has_record:
                 self.record.lost = {key.text: one for key, one in lost.items()}
-            record = self.record if self._has_record else _copy_of_record(self.files)
+            record = self.record if self._has_record else _copy_of_record(self.folder)
             known = {key: row.version for key, row in before.items()} if self._opened else None
-            self.record, aside = rebuild(self.files, record, known, reason)
+            self.record, aside = rebuild(self.folder, record, known, reason)
             self._has_record = True
             self._damage = ""
             self.damaged[aside] = reason
@@ -344,8 +344,8 @@ class MapFiles:
             try:
                 text = self._change(put)
                 self.flush()
-                replace_file(self.files, MAP_FILE, msgspec.json.format(text, indent=1) + b"\n")
-                self.files.sync_names()
+                replace_file(self.folder, MAP_FILE, msgspec.json.format(text, indent=1) + b"\n")
+                self.folder.sync_names()
             except OSError:
                 self.record_is_due = True
                 raise
@@ -395,7 +395,7 @@ class MapFiles:
     def _read(self, query: str, key: ChunkKey) -> bytes | None:
         """Return what a query finds in a chunk's row; None if that is gone, or lost, since."""
         self._reopen()
-        with self._reading, database_errors(self.files), valid_rows():
+        with self._reading, database_errors(self.folder), valid_rows():
             if self._reader is None:
                 raise OSError(errno.EIO, self._damage or "it is closed")
             if (number := self._numbers.get(key)) is None:
@@ -498,7 +498,7 @@ class MapFiles:
         self._reopen()
         if self._writer is None:
             raise OSError(errno.EIO, "it is closed")
-        with database_errors(self.files):
+        with database_errors(self.folder):
             return work(self._writer)
 
     def _reopen(self) -> None:
@@ -557,9 +557,9 @@ class MapFiles:
         self._bring_log_in()
 
 
-def _copy_of_record(files: Folder) -> MapRecord | None:
+def _copy_of_record(folder: Folder) -> MapRecord | None:
     with contextlib.suppress(MapDataError, FileNotFoundError):
-        found = read_map(files)
+        found = read_map(folder)
         return found if found.format == MAP_FORMAT else None
     return None
 

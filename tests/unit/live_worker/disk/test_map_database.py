@@ -25,10 +25,10 @@ from shmmap.chunks.layout import ChunkIdentity, ChunkView, new_header
 from shmmap.chunks.occupancy import Occupancy
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.errors import ConfigError, MapDataError
-from shmmap.live_worker.disk import map_files, schema
+from shmmap.live_worker.disk import map_database, schema
 from shmmap.live_worker.disk.folder import Folder, FolderToRead
 from shmmap.live_worker.disk.maintenance import check
-from shmmap.live_worker.disk.map_files import SCANS_AHEAD, MapFiles
+from shmmap.live_worker.disk.map_database import SCANS_AHEAD, MapDatabase
 from shmmap.live_worker.disk.map_record import MapSettings, Row
 from shmmap.live_worker.disk.rebuilding import finish_replacing, replace_database
 from shmmap.mounts import Mount
@@ -48,13 +48,13 @@ KEYS = [ChunkKey(0, 0, 0), ChunkKey(-1, 2, 0), ChunkKey(5, 5, -5)]
 
 
 @contextmanager
-def opened(directory: Path, settings: MapSettings = SETTINGS) -> Iterator[MapFiles]:
+def opened(directory: Path, settings: MapSettings = SETTINGS) -> Iterator[MapDatabase]:
     """Open a map as a daemon does, and end as one that is killed."""
-    with closing(Folder(directory)) as folder, closing(MapFiles(folder, settings)) as made:
+    with closing(Folder(directory)) as folder, closing(MapDatabase(folder, settings)) as made:
         yield made
 
 
-def chunk(made: MapFiles, key: ChunkKey, version: int) -> bytes:
+def chunk(made: MapDatabase, key: ChunkKey, version: int) -> bytes:
     """The bytes of an empty chunk of this version."""
     view = ChunkView(new_header(made.settings.identity(made.map_id, key, 1)))
     view.state["version"] = version
@@ -68,13 +68,13 @@ def with_body(data: bytes, body: bytes) -> bytes:
     return bytes(header) + struct.pack("<II", zlib.crc32(header), 0) + body
 
 
-def loaded(made: MapFiles, keys: Iterable[ChunkKey]) -> dict[ChunkKey, bytes | None]:
+def loaded(made: MapDatabase, keys: Iterable[ChunkKey]) -> dict[ChunkKey, bytes | None]:
     """What the map has of these chunks."""
     found = {key: made.load(key) for key in keys}
     return {key: bytes(data) if data is not None else None for key, data in found.items()}
 
 
-def version_of(made: MapFiles, key: ChunkKey) -> int:
+def version_of(made: MapDatabase, key: ChunkKey) -> int:
     """The version of a chunk, read whole; 0 where there is none."""
     data = made.load(key)
     return int(ChunkView(data).state["version"]) if data is not None else 0
@@ -132,8 +132,8 @@ def test_a_network_file_system_is_refused(tmp_path: Path, monkeypatch: pytest.Mo
 def test_where_sqlite_keeps_no_log_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As where processes cannot share memory: SQLite has a way of locking that is as poor."""
 
-    def poor(files: Folder, name: str = "map.db", *, mode: str = "rw") -> sqlite3.Connection:
-        return schema.connect(files, name, mode=f"{mode}&vfs=unix-dotfile")
+    def poor(folder: Folder, name: str = "map.db", *, mode: str = "rw") -> sqlite3.Connection:
+        return schema.connect(folder, name, mode=f"{mode}&vfs=unix-dotfile")
 
     monkeypatch.setattr("shmmap.live_worker.disk.rebuilding.connect", poor)
     with pytest.raises(ConfigError, match="cannot keep a log there"), opened(tmp_path):
@@ -173,7 +173,7 @@ def test_the_database_is_as_the_page_says(tmp_path: Path) -> None:
     header = (tmp_path / "map.db").read_bytes()[:100]
     assert header[:20] == b"SQLite format 3\0" + bytes.fromhex("1000 0202"), "pages of 4096 bytes, WAL"
     assert (header[60:64], header[68:72]) == (bytes([0, 0, 0, 1]), b"SHML")
-    page = (Path(map_files.__file__).parents[3] / "chunks" / "CHUNKS.md").read_text(encoding="utf-8")
+    page = (Path(map_database.__file__).parents[2] / "chunks" / "CHUNKS.md").read_text(encoding="utf-8")
     (tables,) = re.findall(r"```sql\n(.*?)\n```", page, re.DOTALL)
     with database(tmp_path) as reader:
         found = [text for (text,) in reader.execute("select sql from sqlite_master order by rowid")]
@@ -233,7 +233,7 @@ def copy_of(directory: Path, other: Path) -> None:
 
 
 def test_the_log_is_brought_in_when_it_is_long(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(map_files, "LOG_BYTES", 1 << 16)
+    monkeypatch.setattr(map_database, "LOG_BYTES", 1 << 16)
     with opened(tmp_path) as made:
         for version in range(1, 60):
             made.save(KEYS[0], chunk(made, KEYS[0], version))
@@ -246,8 +246,8 @@ def test_a_reader_that_keeps_its_transaction_is_a_problem_with_a_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The log grows to its bound; nothing is saved then, until the reader has ended."""
-    monkeypatch.setattr(map_files, "LOG_BYTES", 1 << 16)
-    monkeypatch.setattr(map_files, "MAX_LOG_BYTES", 1 << 18)
+    monkeypatch.setattr(map_database, "LOG_BYTES", 1 << 16)
+    monkeypatch.setattr(map_database, "MAX_LOG_BYTES", 1 << 18)
     with opened(tmp_path) as made:
         made.save(KEYS[0], chunk(made, KEYS[0], 1))
         with database(tmp_path) as reader:
@@ -301,7 +301,7 @@ def test_saving_and_reading_beside_the_log_brought_in(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Threads that save, load and flush: each reads a version that was saved."""
-    monkeypatch.setattr(map_files, "LOG_BYTES", 1 << 16)
+    monkeypatch.setattr(map_database, "LOG_BYTES", 1 << 16)
     failed: list[BaseException] = []
     with opened(tmp_path) as made:
         for key in KEYS:
@@ -359,7 +359,7 @@ def any_body(monkeypatch: pytest.MonkeyPatch) -> None:
         check_identity(check_file(data, path), identity, path)
         return bytearray(data)
 
-    monkeypatch.setattr(map_files, "decode_chunk", checked)
+    monkeypatch.setattr(map_database, "decode_chunk", checked)
 
 
 def stored(directory: Path, chunks: int, rng: random.Random) -> dict[ChunkKey, bytes]:
@@ -484,7 +484,7 @@ def test_the_record_is_in_the_copy_where_the_first_page_is_damaged(tmp_path: Pat
     assert files_of(tmp_path) == before
 
 
-@pytest.mark.parametrize("fails", [(Folder, "sync"), (map_files, "read_rows")])
+@pytest.mark.parametrize("fails", [(Folder, "sync"), (map_database, "read_rows")])
 def test_a_disk_too_full_for_a_rebuild_is_tried_again(
     tmp_path: Path, any_body: None, monkeypatch: pytest.MonkeyPatch, fails: tuple[object, str]
 ) -> None:
