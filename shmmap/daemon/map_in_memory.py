@@ -45,8 +45,8 @@ from shmmap.live_messages import Begin
 from shmmap.live_settings import LiveSettings, live_directory
 from shmmap.logfmt import log
 from shmmap.mounts import mount_of
-from shmmap.segment.directory import DEFAULT_SHM_DIR, ShmDirectory, is_full
-from shmmap.segment.names import segment_prefix
+from shmmap.segment.directory import ShmDirectory, is_full
+from shmmap.segment.names import DEFAULT_SHM_DIR, segment_prefix
 from shmmap.segment.process_limits import limit_behind
 from shmmap.statistics.identity import DaemonIdentity, pid_namespace, start_time_ticks
 from shmmap.statistics.writer import StatisticsWriter

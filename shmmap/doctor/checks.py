@@ -38,8 +38,7 @@ from shmmap.doctor.published import (
 )
 from shmmap.doctor.verdicts import Finding, skip
 from shmmap.errors import ShmmapError
-from shmmap.segment.directory import DEFAULT_SHM_DIR
-from shmmap.segment.names import usual_directory
+from shmmap.segment.names import DEFAULT_SHM_DIR, usual_directory
 from shmmap.statistics.reader import read_statistics
 
 CHECKS: Final[dict[str, Callable[[Diagnosis], Finding]]] = {  # in the order of the output

@@ -17,7 +17,7 @@ from shmmap.doctor.verdicts import Finding, fail, ok, skip, warn
 from shmmap.errors import ConfigError
 from shmmap.live_settings import SERVICE_STATE, live_directory
 from shmmap.quantities import counted, format_bytes
-from shmmap.segment.directory import DEFAULT_SHM_DIR
+from shmmap.segment.names import DEFAULT_SHM_DIR
 
 NAMED: Final = 3
 """Problems and readers that are listed, at most."""

@@ -16,7 +16,8 @@ import shmmap
 from shmmap.chunks.chunk_file import encode_chunk, read_file_header
 from shmmap.chunks.marking import Marker
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.client.live.live_map import ChunkInfo, LiveMap
+from shmmap.client.live.chunk_reader import ChunkInfo
+from shmmap.client.live.live_map import LiveMap
 from shmmap.live_worker.disk.folder import Folder
 from shmmap.live_worker.disk.map_database import MapDatabase
 from shmmap.live_worker.disk.map_record import MapSettings, Row

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import pytest
 import shmmap_clients
+import site_contents
 
 import shmmap
 
@@ -285,6 +286,17 @@ def modules_with_a_list() -> list[str]:
         for module in (*modules(), *modules(CLIENTS))
         if re.search("^__all__ = ", source(module).read_text(encoding="utf-8"), re.MULTILINE)
     ]
+
+
+def test_lists_are_of_public_modules_and_of_names_from_others() -> None:
+    """Nothing else needs one, since nothing is imported with ``*``."""
+    for module in set(modules_with_a_list()) - {page.module for page in site_contents.API}:
+        names = set(importlib.import_module(module).__all__)
+        nodes = ast.walk(parsed(source(module)))
+        imported_names = {
+            alias.name for node in nodes if isinstance(node, ast.ImportFrom) for alias in node.names
+        }
+        assert names & imported_names, f"{module} needs no __all__"
 
 
 @pytest.mark.parametrize("module", modules_with_a_list())

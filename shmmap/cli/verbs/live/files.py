@@ -119,8 +119,8 @@ def run_fsck(args: argparse.Namespace) -> int:
 
     path = _directory_from(args)
     if args.read_only:
-        with opened_folder_to_read(path) as files:
-            found = check(files, path)
+        with opened_folder_to_read(path) as folder:
+            found = check(folder, path)
     else:
         busy = "--read-only looks at it nevertheless"
         with opened_folder(path, f"stop it; {busy}") as folder:
