@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Callable
+from contextlib import closing
 from typing import Final
 
 from shmmap.daemon.config import DaemonConfig
@@ -84,7 +85,7 @@ def examine(config: DaemonConfig, file: str, machine: Machine | None = None) -> 
     except OSError as error:
         seen, unreadable = None, f"{config.shm_dir}: {error.strerror}"
     if seen is not None and seen.identity is not None:
-        with DaemonLists("shmmap doctor") as lists:
+        with closing(DaemonLists("shmmap doctor")) as lists:
             lists.add_to(seen, clients=bool(seen.identity.live))
     if seen is not None and seen.identity is not None and not (config.endpoint or config.runtime_dir):
         path = seen.identity.endpoint

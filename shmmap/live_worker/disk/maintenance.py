@@ -87,7 +87,7 @@ def check(folder: FolderToRead, path: str) -> CheckedMap:
         A chunk is compressed by a package that is not installed.
     """
     try:
-        with StoredMap(folder, path) as stored:
+        with contextlib.closing(StoredMap(folder, path)) as stored:
             rows, lost = dict(stored.rows), dict(stored.lost)
             for key, row in stored.rows.items():
                 try:

@@ -11,7 +11,6 @@ import contextlib
 import os
 import sqlite3
 from collections.abc import Iterator
-from types import TracebackType
 
 from shmmap.chunks.chunk_file import decode_chunk
 from shmmap.chunks.layout import ChunkView
@@ -35,7 +34,7 @@ from shmmap.live_worker.disk.schema import (
 
 
 class StoredMap:
-    """A live map's settings, and its chunks one by one.  A context manager, which closes the database.
+    """A live map's settings, and its chunks one by one.
 
     Parameters
     ----------
@@ -128,14 +127,6 @@ class StoredMap:
         """Close the database."""
         self._database.close()
 
-    def __enter__(self) -> StoredMap:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
 
 def asides(folder: FolderToRead) -> list[str]:
     """Return the names of damaged databases that were put aside."""
@@ -158,6 +149,13 @@ def opened_folder_to_read(path: str) -> Iterator[FolderToRead]:
     with contextlib.closing(_opened(path)) as folder:
         require_database(folder)
         yield folder
+
+
+@contextlib.contextmanager
+def opened_map(path: str) -> Iterator[StoredMap]:
+    """Open the live map in a directory to read it; raise as `opened_folder_to_read` and `StoredMap`."""
+    with opened_folder_to_read(path) as folder, contextlib.closing(StoredMap(folder, path)) as stored:
+        yield stored
 
 
 @contextlib.contextmanager

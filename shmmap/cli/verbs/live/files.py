@@ -74,7 +74,7 @@ def _places() -> Iterator[tuple[str, str]]:
     config = load_config({}, file=installed_config_file())
     yield from ((one.name, one.path) for one in config.live if one.path)
     with contextlib.suppress(ShmmapError, OSError):  # no daemon, which may have been given another directory
-        with DaemonLists() as lists:
+        with contextlib.closing(DaemonLists()) as lists:
             lists.add_to(served := read_statistics(config.instance, config.shm_dir))
         yield from ((row.name, row.path) for row in served.live)
     for state in filter(None, (state_directory(config.instance), f"{SERVICE_STATE}/{config.instance}")):
@@ -221,11 +221,11 @@ def add_export(subparsers: Subparsers) -> None:
 def _run_export(args: argparse.Namespace) -> int:
     """Export the map, and print the result."""
     from shmmap.live_worker.disk.exporting import export
-    from shmmap.live_worker.disk.stored_map import StoredMap, opened_folder_to_read
+    from shmmap.live_worker.disk.stored_map import opened_map
 
     path = _directory_from(args)
     began_s = time.monotonic()
-    with opened_folder_to_read(path) as folder, StoredMap(folder, path) as stored:
+    with opened_map(path) as stored:
         made = export(
             stored,
             args.output,

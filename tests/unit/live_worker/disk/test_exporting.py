@@ -20,7 +20,7 @@ from shmmap.live_worker.disk.exporting import ExportedVoxels, Format, Voxels, ex
 from shmmap.live_worker.disk.folder import Folder
 from shmmap.live_worker.disk.map_database import MapDatabase
 from shmmap.live_worker.disk.map_record import MapSettings
-from shmmap.live_worker.disk.stored_map import StoredMap, opened_folder_to_read
+from shmmap.live_worker.disk.stored_map import StoredMap, opened_map
 from tests.support.divided_map import read_pcd
 from tests.support.live_drive import RESOLUTION, SETTINGS, Voxel
 from tests.support.live_reference import contents, stored_drive
@@ -39,7 +39,7 @@ def exported(
     translate: Translation = "auto",
     force: bool = False,
 ) -> ExportedVoxels | None:
-    with opened_folder_to_read(str(directory)) as folder, StoredMap(folder, str(directory)) as stored:
+    with opened_map(str(directory)) as stored:
         return export(
             stored, place(directory, kind), kind, voxels=voxels,
             translate=translate, force=force,

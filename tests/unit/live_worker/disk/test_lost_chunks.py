@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import errno
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -117,7 +118,7 @@ class Damaged:
     def exported(self) -> ExportedVoxels | None:
         folder = FolderToRead(self.directory)
         try:
-            with StoredMap(folder, str(self.directory)) as stored:
+            with closing(StoredMap(folder, str(self.directory))) as stored:
                 return export(stored, self.shm / "out.ply", "ply", voxels="both", force=True)
         finally:
             folder.close()

@@ -121,7 +121,7 @@ def check_in_another_process(directory: Path) -> str:
 def test_a_daemon_that_begins_while_the_map_is_read(tmp_path: Path) -> None:
     """Without a log the database is read as a file without a writer; then it is opened again."""
     stored_drive(tmp_path)
-    with closing(FolderToRead(tmp_path)) as folder, StoredMap(folder, str(tmp_path)) as stored:
+    with closing(FolderToRead(tmp_path)) as folder, closing(StoredMap(folder, str(tmp_path))) as stored:
         assert contents(tmp_path).keys() == {"map.db", "map.json"}, "reading makes no log"
         with closing(Folder(tmp_path)) as locked, closing(MapDatabase(locked, SETTINGS)) as database:
             for version in range(2000, 2100):
