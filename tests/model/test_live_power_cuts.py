@@ -92,15 +92,15 @@ class Disk:
         (found / "map.db").write_bytes(database)
         (found / "map.db-wal").write_bytes(log)
         (found / "map.json").write_bytes(self.read("map.json"))
-        with closing(Folder(found)) as folder, closing(MapDatabase(folder, SETTINGS)) as database:
-            assert (database.lost, database.damaged) == ({}, {})
-            assert database.map_id == self.database.map_id
+        with closing(Folder(found)) as folder, closing(MapDatabase(folder, SETTINGS)) as again:
+            assert (again.lost, again.damaged) == ({}, {})
+            assert again.map_id == self.database.map_id
             for key, version in self.durable.items():
-                assert database.version(key) >= version
-                data = database.load(key)
+                assert again.version(key) >= version
+                data = again.load(key)
                 assert data is not None
-                assert ChunkView(data).state["version"] == database.version(key)
-            database.begin_run()
+                assert ChunkView(data).state["version"] == again.version(key)
+            again.begin_run()
         with closing(sqlite3.connect(found / "map.db")) as tables:
             assert tables.execute("pragma integrity_check").fetchone() == ("ok",)
 
