@@ -29,6 +29,7 @@ from shmmap.errors import CannotStart, SegmentCorrupt
 from shmmap.live_worker import chunk_memory
 from shmmap.live_worker.chunk_memory import ChunkFile, ChunkMemory, live_prefix
 from tests.support.accounts import MEMBER
+from tests.support.daemon_process import open_files
 from tests.support.odd_files import failing
 
 PREFIX = live_prefix("test", "lidar")
@@ -45,13 +46,12 @@ def directory() -> Iterator[Path]:
 
 @pytest.fixture
 def memory(directory: Path) -> Iterator[ChunkMemory]:
-    before = len(os.listdir("/proc/self/fd"))
     one = ChunkMemory(str(directory), PREFIX)
     yield one
     for name, _, _ in list(one.names()):
         one.remove(name)
     one.close()
-    assert len(os.listdir("/proc/self/fd")) == before
+    assert not [path for path in open_files().values() if path.startswith(str(directory))]
     assert not [line for line in Path("/proc/self/maps").read_text().splitlines() if str(directory) in line]
 
 
