@@ -66,6 +66,11 @@ class CatalogueChange:
         """Total number of cells added, removed, changed and moved."""
         return len(self.added) + len(self.removed) + len(self.changed) + len(self.moved)
 
+    @property
+    def touched(self) -> Indices:
+        """Cells in both whose versions differ."""
+        return np.concatenate((self.changed, self.moved))
+
     def ids(self, how: str, most: int | None = None) -> tuple[str, ...]:
         """Return ids of cells, at most ``most``; ``how`` is added, removed, changed or moved."""
         cells = self.old if how == "removed" else self.new

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
 from functools import cached_property
 from typing import Final, NamedTuple, TypeAlias
@@ -69,7 +68,7 @@ class PublishedView:
         self._differing: tuple[Root, list[_Pair]] | None = None
         self._compared: set[_Pair] = set()
         self._found = _Difference([], [], [], [])
-        self._change: CatalogueChange | None = None
+        self._changed: tuple[Indices, Indices, Indices, Indices, bool] | None = None
 
     @cached_property
     def _ready(self) -> dict[str, int]:
@@ -214,14 +213,14 @@ class PublishedView:
         same_ids = before.id_prefix == self.id_prefix
         if self._differing is None or self._differing[0] is not before.root:
             self._compared.clear()
-            self._found, self._change = _Difference([], [], [], []), None
+            self._found, self._changed = _Difference([], [], [], []), None
             self._differing = before.root, _differing_shards(before.root, self.root, same_ids=same_ids)
         pairs = self._differing[1]
         theirs = {was: before.pages.page(was) for was, _ in pairs if was is not None}
         ours = {now: self.pages.page(now) for _, now in pairs if now is not None}
         if None in theirs.values():
             return unknown
-        for was, now in pairs if self._change is None else ():
+        for was, now in pairs if self._changed is None else ():
             old = theirs[was] if was is not None else None
             new = ours[now] if now is not None else None
             if (was, now) not in self._compared and (now is None or new is not None):
@@ -229,14 +228,14 @@ class PublishedView:
                 _compare(old, new, self._found, same_ids=same_ids)
         if None in ours.values():
             return unknown
-        if self._change is None:
+        if self._changed is None:
             # a cell that went to another shard shifts the numbers of others
             same_numbers = not self._found.added and not self._found.removed
             if same_ids and self._found.added and self._found.removed:
                 self._note_moved(before)
-            found = (np.sort(np.array(some, np.intp)) for some in self._found)
-            self._change = CatalogueChange(before, self, *found, same_numbers=same_numbers)
-        return dataclasses.replace(self._change, old=before)
+            added, removed, changed, moved = (np.sort(np.array(some, np.intp)) for some in self._found)
+            self._changed = added, removed, changed, moved, same_numbers
+        return CatalogueChange(before, self, *self._changed)
 
     def _note_moved(self, before: PublishedView) -> None:
         """Note as moved the cells that left one shard and appear in another."""

@@ -250,9 +250,10 @@ class PagedView:
             return CatalogueChange(
                 before, self, nothing, nothing, nothing, nothing, same_numbers=False, known=False
             )
+        same_numbers = change.same_numbers and np.array_equal(own, its)
         return CatalogueChange(
             before, self, np.sort(own[change.added]), np.sort(its[change.removed]),
-            np.sort(own[change.changed]), np.sort(own[change.moved]), same_numbers=np.array_equal(own, its) and change.same_numbers,
+            np.sort(own[change.changed]), np.sort(own[change.moved]), same_numbers,
         )  # fmt: skip
 
     def ids(self, indices: Indices) -> list[str]:
