@@ -113,10 +113,13 @@ class LostWorkers:
                 self.loads.requeue(load)
                 continue
             log.error("loader replaced", path=job.source.name, reason=why)
-            load.spent_s = spent_s
+            self.loads.charge(load, spent_s)
+            sources: tuple[Stamp, ...] = ()
+            if load.attempt is not None:
+                load.attempt.took_s, sources = spent_s, load.attempt.sources
             # after a timeout the file is not accessed again: its file system may be what hangs
             blamed = code == "load_failed" and not why.startswith(OUT_OF_MEMORY)
-            known = load.sources[0] if blamed and load.sources else None
+            known = sources[0] if blamed and sources else None
             self.fail(load, code, f"{job.source.name}: {why}", known, now_s)
 
     def _unfinished(self, worker: Worker) -> Iterator[tuple[Work, Load]]:

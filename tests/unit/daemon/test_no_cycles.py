@@ -72,7 +72,7 @@ def connected(one: WholeDaemon, context: zmq.Context[Any]) -> zmq.Socket[Any]:
 
 def test_what_refers_to_itself_is_found() -> None:
     load = Load(Key("0_0.pcd", "points"), 100, 0.0, 1)
-    load.payer = (load,)
+    load.asker = (load,)
     del load
     assert left_behind() == ["Key", "Load"]
 
