@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Records shared by all packages of the daemon: keys, resident and retired segments, loads, failures."""
+"""Records shared by all packages of the daemon: keys, resident and retired segments, failures."""
 
 from __future__ import annotations
 
-import enum
-from collections.abc import Hashable
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple, TypeAlias
+from typing import Final, NamedTuple
 
 from shmmap.segment.directory import is_full
 from shmmap.segment.version import Stamp
@@ -74,80 +72,6 @@ class Retired:
     probe_after_s: float = 0.0
     interval_s: float = 0.0
     tick_over_s: float = 0.0
-
-
-class Purpose(enum.Enum):
-    """Why a segment is loaded."""
-
-    DEMAND = "a client has asked for it"
-    SPARE = "only spare requests have asked for it"
-    WISH = "no client has asked for it yet"
-
-
-@dataclass(frozen=True, slots=True)
-class LeftoverCheck:
-    """Check of a previous run's segment; its cell is loaded if that fails and a client has asked for it."""
-
-    resident: Resident
-    is_asked_for: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class FailedFileCheck:
-    """Check of a file that failed in the state ``stamp``: in another state its cell is loaded."""
-
-    stamp: Stamp
-
-
-Work: TypeAlias = Purpose | LeftoverCheck | FailedFileCheck
-"""What a worker has to do for a key: make a segment, or a check that may lead to that."""
-
-
-@dataclass(slots=True, eq=False)
-class Attempt:
-    """A worker's work at a load.
-
-    ``sources`` are the states of its file and its neighbours' files in the catalogue when the worker was
-    given the job, none for a check, and ``version`` is the version that follows from them.  ``took_s`` is the
-    time that it took in the end, fetching included.
-    """
-
-    started_s: float
-    sources: tuple[Stamp, ...] = ()
-    version: int = 0
-    took_s: float = 0.0
-
-
-@dataclass(slots=True, eq=False)
-class Load:
-    """Work that is queued or that a worker does.
-
-    ``reserved`` bytes are promised to it while it runs, which is while there is an ``attempt``.  ``computed``
-    means that the layer is computed, which may take long.  ``link_bytes`` is what it fetches from a remote
-    origin.  ``losses`` counts loaders that were lost through no fault of this load.
-    """
-
-    key: Key
-    estimate: int
-    priority: float
-    number: int
-    work: Work = Purpose.DEMAND
-    asker: Hashable = None
-    computed: bool = False
-    attempt: Attempt | None = None
-    reserved: int = 0
-    link_bytes: int = 0
-    losses: int = 0
-
-    @property
-    def is_running(self) -> bool:
-        """Whether a worker has it."""
-        return self.attempt is not None
-
-    @property
-    def is_ahead(self) -> bool:
-        """Whether no client needs its segment now."""
-        return self.work is Purpose.WISH or self.work is Purpose.SPARE
 
 
 @dataclass(slots=True)

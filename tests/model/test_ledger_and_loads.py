@@ -24,9 +24,9 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from shmmap.daemon.cache.evictor import Evictor
 from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S, Reclaimer
-from shmmap.daemon.loading.loads import Loads
+from shmmap.daemon.loading.loads import Attempt, Load, Loads
 from shmmap.daemon.pins.watch import PinWatch
-from shmmap.daemon.records import Attempt, Failure, Key, Load, Resident
+from shmmap.daemon.records import Failure, Key, Resident
 from shmmap.daemon.transport.sessions import Session, Sessions
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import lock_slot, prepare_process

@@ -8,10 +8,9 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from shmmap.daemon.host.memory import memory_limit_bytes, out_of_memory_kills
-from shmmap.daemon.loading.loads import Loads
+from shmmap.daemon.loading.loads import Load, Loads
 from shmmap.daemon.loading.room import Room
 from shmmap.daemon.loading.worker_pool import Work, Worker, WorkerPool
-from shmmap.daemon.records import Load
 from shmmap.installed import RESTART, is_replaced
 from shmmap.logfmt import log
 from shmmap.quantities import format_bytes

@@ -16,10 +16,10 @@ from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.loading.link import Link
-from shmmap.daemon.loading.loads import Loads
+from shmmap.daemon.loading.loads import Attempt, Load, Loads, Purpose
 from shmmap.daemon.loading.look_ahead import URGENT_S, Prefetch
 from shmmap.daemon.loading.worker_pool import WorkerPool
-from shmmap.daemon.records import Attempt, Key, Load, Purpose, Resident
+from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.transport.sessions import MOVES_PER_STEP, Session
 
 MAX_PATHS: Final = 256

@@ -11,11 +11,11 @@ from shmmap.daemon.cache.evictor import Evictor
 from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.cache.lost_segments import LostSegments
 from shmmap.daemon.cache.reclaimer import Reclaimer
-from shmmap.daemon.loading.loads import Loads
+from shmmap.daemon.loading.loads import Load, Loads, Purpose
 from shmmap.daemon.loading.prefetcher import Prefetcher
 from shmmap.daemon.loading.worker_messages import Decision, Need
 from shmmap.daemon.loading.worker_pool import Worker, WorkerPool
-from shmmap.daemon.records import Load, Purpose, Resident
+from shmmap.daemon.records import Resident
 from shmmap.daemon.turns import WatchedDescriptors
 from shmmap.quantities import format_bytes
 

@@ -19,7 +19,7 @@ from typing import Final, Protocol
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.loading.link import Link
-from shmmap.daemon.loading.loads import Loads
+from shmmap.daemon.loading.loads import Attempt, FailedFileCheck, LeftoverCheck, Load, Loads, Purpose
 from shmmap.daemon.loading.lost_workers import LostWorkers
 from shmmap.daemon.loading.prefetcher import Prefetcher
 from shmmap.daemon.loading.room import Room
@@ -37,18 +37,7 @@ from shmmap.daemon.loading.worker_messages import (
 )
 from shmmap.daemon.loading.worker_pool import NOT_OPENED, Opened, Worker, WorkerPool
 from shmmap.daemon.map.catalogue_view import CatalogueView
-from shmmap.daemon.records import (
-    SPACE_CODES,
-    Attempt,
-    FailedFileCheck,
-    Failure,
-    Key,
-    LeftoverCheck,
-    Load,
-    Purpose,
-    Resident,
-    failure_code,
-)
+from shmmap.daemon.records import SPACE_CODES, Failure, Key, Resident, failure_code
 from shmmap.errors import Replaced
 from shmmap.failpoints import step
 from shmmap.installed import RESTART, is_replaced

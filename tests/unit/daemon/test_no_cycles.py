@@ -16,7 +16,8 @@ import pytest
 import zmq
 
 import shmmap.daemon
-from shmmap.daemon.records import Key, Load
+from shmmap.daemon.loading.loads import Load
+from shmmap.daemon.records import Key
 from shmmap.protocol import messages as m
 from shmmap.protocol.codec import encode, pack_versions
 from tests.support.divided_map import DividedMap, random_points

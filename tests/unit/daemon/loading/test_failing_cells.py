@@ -14,8 +14,8 @@ import pytest
 from shmmap import MapWindow, Offline, connect
 from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.loading import loads
-from shmmap.daemon.loading.loads import Loads
-from shmmap.daemon.records import Attempt, FailedFileCheck, Failure, Key
+from shmmap.daemon.loading.loads import Attempt, FailedFileCheck, Loads
+from shmmap.daemon.records import Failure, Key
 from shmmap.protocol.codec import pack_versions
 from shmmap.protocol.messages import Differential, Selected
 from tests.support.divided_map import DividedMap

@@ -11,8 +11,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shmmap.daemon.cache.ledger import Ledger
-from shmmap.daemon.loading.loads import BACKGROUND, LoadQueue, Loads
-from shmmap.daemon.records import Attempt, FailedFileCheck, Key, LeftoverCheck, Load, Purpose, Resident
+from shmmap.daemon.loading.loads import (
+    BACKGROUND,
+    Attempt,
+    FailedFileCheck,
+    LeftoverCheck,
+    Load,
+    LoadQueue,
+    Loads,
+    Purpose,
+)
+from shmmap.daemon.records import Key, Resident
 
 _numbers = count()
 

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S
-from shmmap.daemon.loading.loads import PREFETCH
+from shmmap.daemon.loading.loads import PREFETCH, Attempt, Load, Purpose
 from shmmap.daemon.loading.look_ahead import IN_A_ROW, URGENT_S
 from shmmap.daemon.loading.prefetcher import FULL_S, KEPT, MAX_PATHS
-from shmmap.daemon.records import Attempt, Key, Load, Purpose
+from shmmap.daemon.records import Key
 from shmmap.daemon.transport.sessions import Session
 from shmmap.protocol.events import Loaded, Recent, decode_event
 from shmmap.protocol.messages import Area, CircleMessage, Intent, Selected
