@@ -73,13 +73,14 @@ class Attempt:
     """A worker's work at a load.
 
     ``sources`` are the states of its file and its neighbours' files in the catalogue when the worker was
-    given the job, none for a check, and ``version`` is the version that follows from them.  ``took_s`` is the
-    time that it took in the end, fetching included.
+    given the job, none for a check, and ``version`` is the version that follows from them.  In the end,
+    ``spent_s`` is the loader time that it took, and ``took_s`` the whole time, fetching included.
     """
 
     started_s: float
     sources: tuple[Stamp, ...] = ()
     version: int = 0
+    spent_s: float = 0.0
     took_s: float = 0.0
 
 
@@ -131,14 +132,6 @@ class _Asker:
     running: int = 0
 
 
-@dataclass(eq=False, slots=True)
-class _Charge:
-    """Loader time charged for a running load to the asker whose turn it was, an estimate at first."""
-
-    payer: Hashable
-    estimate_s: float
-
-
 class LoadQueue:
     """Loads that wait for a worker or for memory; a load is queued from `push` to `discard`.
 
@@ -149,7 +142,7 @@ class LoadQueue:
         self.changes = 0
         self._loads: dict[int, Load] = {}
         self._askers: dict[Hashable, _Asker] = {}
-        self._charges: dict[Load, _Charge] = {}
+        self._charged: dict[Load, tuple[Hashable, float]] = {}  # running loads: asker, estimated seconds
         self._clock_s = 0.0
         self._chosen: Hashable = None
 
@@ -180,29 +173,22 @@ class LoadQueue:
         self._loads.pop(load.number, None)
 
     def start(self, load: Load) -> None:
-        """Take out the load that `choose` has chosen, and charge its asker; `end` has to follow."""
+        """Take out the load that `choose` has chosen, and charge its asker for its bytes."""
         self.discard(load)
-        charge = self._charges[load] = _Charge(self._chosen, LOAD_S + load.estimate * BYTE_S)
-        payer = self._askers.get(charge.payer)
+        estimate_s = LOAD_S + load.estimate * BYTE_S
+        self._charged[load] = self._chosen, estimate_s
+        payer = self._askers.get(self._chosen)
         if payer is not None:
             payer.running += 1
-            payer.clock_s += charge.estimate_s
+            payer.clock_s += estimate_s
 
-    def charge(self, load: Load, spent_s: float) -> None:
-        """Charge the loader time that a running load has taken, instead of its estimate."""
-        charge = self._charges[load]
-        payer = self._askers.get(charge.payer)
-        if payer is not None:
-            payer.clock_s += spent_s - charge.estimate_s
-        charge.estimate_s = 0.0
-
-    def end(self, load: Load) -> None:
-        """Note that a load no longer runs; if no time was charged, its estimate is given back."""
-        charge = self._charges.pop(load)
-        payer = self._askers.get(charge.payer)
+    def end(self, load: Load, spent_s: float) -> None:
+        """Charge a load that no longer runs for the loader time that it took, instead of its bytes."""
+        asker, estimate_s = self._charged.pop(load)
+        payer = self._askers.get(asker)
         if payer is not None:
             payer.running -= 1
-            payer.clock_s -= charge.estimate_s
+            payer.clock_s += spent_s - estimate_s
 
     def choose(self, *, points: bool = True, layers: bool = True) -> Load | None:
         """Choose the next load among points, computed layers, or both; None if there is none."""
@@ -375,10 +361,6 @@ class Loads:
             self._link.begin(load, load.link_bytes, attempt.started_s, cause)
         return True
 
-    def charge(self, load: Load, spent_s: float) -> None:
-        """Charge the loader time that a running load has taken; without, its run costs nothing."""
-        self._queue.charge(load, spent_s)
-
     def grow(self, load: Load, nbytes: int) -> bool:
         """Raise a running load's reservation to ``nbytes``; return False if that does not fit."""
         extra = max(0, nbytes - load.reserved)
@@ -399,8 +381,8 @@ class Loads:
         self._ledger.reserved_bytes -= load.reserved
         load.reserved = 0
         if load.attempt is not None:
+            self._queue.end(load, load.attempt.spent_s)
             load.attempt = None
-            self._queue.end(load)
             if self._link is not None:
                 self._link.end(load)
 

@@ -112,10 +112,10 @@ class LostWorkers:
                 self.loads.requeue(load)
                 continue
             log.error("loader replaced", path=job.source.name, reason=why)
-            self.loads.charge(load, spent_s)
             sources: tuple[Stamp, ...] = ()
-            if load.attempt is not None:
-                load.attempt.took_s, sources = spent_s, load.attempt.sources
+            if (attempt := load.attempt) is not None:
+                attempt.spent_s = attempt.took_s = spent_s
+                sources = attempt.sources
             # after a timeout the file is not accessed again: its file system may be what hangs
             blamed = code == "load_failed" and not why.startswith(OUT_OF_MEMORY)
             known = sources[0] if blamed and sources else None

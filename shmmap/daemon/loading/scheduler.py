@@ -329,9 +329,11 @@ class Scheduler:
         if index is None:  # its cell left the map
             self._end(load)
             return HandOut.SETTLED
-        if isinstance(load.work, LeftoverCheck) and not self._is_in_service(load.work.resident):
-            self._load_after_all(load)
-            return HandOut.SETTLED
+        if isinstance(load.work, LeftoverCheck):
+            resident = load.work.resident
+            if self._ledger.resident_named(resident.name) is not resident:  # it was retired
+                self._load_after_all(load)
+                return HandOut.SETTLED
         if load.computed and self._waits_for_pages(load, now_s):
             return HandOut.SETTLED
         shortage = self._ledger.shortage(load.estimate) if load.estimate else 0
@@ -346,7 +348,10 @@ class Scheduler:
 
     def _start(self, load: Load, index: int, now_s: float) -> HandOut:
         """Give a load for which there is memory to a worker, if the link has room."""
-        attempt = self._attempt(load, index, now_s)
+        layers, layer, attempt = self._layers, load.key.layer, Attempt(now_s)
+        if isinstance(load.work, Purpose):
+            sources = map(self._cache.catalogue.stamp, (index, *layers.neighbours(index, layer)))
+            attempt.sources, attempt.version = tuple(sources), layers.version(index, layer)
         job = self._job(load, index, self._job_numbers + 1)
         load.link_bytes = 0
         if self._needed_bytes is not None and isinstance(job, Job):
@@ -381,18 +386,6 @@ class Scheduler:
         # a wish waits for what is under way: whatever comes of that wakes the loop
         self._link_s = self.link.rests_until_s if load.is_ahead else self.link.next_s()
         return False
-
-    def _is_in_service(self, resident: Resident) -> bool:
-        """Whether a segment has not been retired before its check began."""
-        return self._ledger.resident_named(resident.name) is resident
-
-    def _attempt(self, load: Load, index: int, now_s: float) -> Attempt:
-        """Return what the catalogue knows of a load's sources now."""
-        if not isinstance(load.work, Purpose):
-            return Attempt(now_s)
-        layer = load.key.layer
-        sources = map(self._cache.catalogue.stamp, (index, *self._layers.neighbours(index, layer)))
-        return Attempt(now_s, tuple(sources), self._layers.version(index, layer))
 
     def _job(self, load: Load, index: int, number: int) -> Job | Check:
         """Return a worker's job for a load."""
@@ -445,10 +438,10 @@ class Scheduler:
             self.room.forget(message.number)
         load = self._jobs.pop(message.number, None)
         try:
-            if load is None or load.attempt is None:
+            if load is None or (attempt := load.attempt) is None:
                 return
-            self.loads.charge(load, spent_s)
-            load.attempt.took_s = now_s - load.attempt.started_s if worker.fetches else spent_s
+            attempt.spent_s = spent_s
+            attempt.took_s = now_s - attempt.started_s if worker.fetches else spent_s
             if isinstance(message, Checked):
                 self._on_checked(load, message, now_s)
             elif isinstance(message, Failed):
@@ -458,7 +451,7 @@ class Scheduler:
                 self._fail(load, message.code, message.message, message.stamp, now_s, unread=unread)
             elif fd >= 0:
                 step("daemon.received")
-                self._publish(load, load.attempt, message, fd, now_s)
+                self._publish(load, attempt, message, fd, now_s)
             else:  # the job was only a check
                 self._fail(load, "load_failed", "the loader says it has a segment", None, now_s)
         finally:

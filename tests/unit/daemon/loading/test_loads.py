@@ -73,8 +73,7 @@ def test_turns_are_by_the_time_that_loads_took_in_the_end() -> None:
         one = start(queue)
         assert one is not None
         served.append(one.asker)
-        queue.charge(one, 8.0 if one.asker == "slow" else 1.0)
-        queue.end(one)
+        queue.end(one, 8.0 if one.asker == "slow" else 1.0)
     assert served.count("slow") == 2
     assert served.count("quick") == 10
 
@@ -88,8 +87,7 @@ def test_a_debt_is_remembered_while_others_wait() -> None:
     served: list[Hashable] = []
     while (one := start(queue)) is not None:
         served.append(one.asker)
-        queue.charge(one, 5.0 if one.asker == "slow" else 1.0)
-        queue.end(one)
+        queue.end(one, 5.0 if one.asker == "slow" else 1.0)
         if one.asker == "slow":
             queue.push(load(asker="slow"), 0.0, "slow")
         if len(served) == 11:
@@ -99,8 +97,7 @@ def test_a_debt_is_remembered_while_others_wait() -> None:
     for asker in ("slow", "quick"):  # no client waited in between: nothing is owed
         queue.push(one := load(), 0.0, asker)
         assert start(queue) is one
-        queue.charge(one, 5.0)
-        queue.end(one)
+        queue.end(one, 5.0)
         assert queue.choose() is None
     queue.push(load(asker="slow"), 1.0, "slow")
     queue.push(load(asker="quick"), 2.0, "quick")
@@ -116,7 +113,7 @@ def test_what_goes_back_costs_nothing() -> None:
     queue.push(first, 0.0, "a")
     queue.push(second, 1.0, "b")
     assert start(queue) is first
-    queue.end(first)
+    queue.end(first, 0.0)
     queue.push(first, 0.0, "a")
     assert start(queue) is first
 
