@@ -90,7 +90,8 @@ class Load:
 
     ``reserved`` bytes are promised to it while it runs, which is while there is an ``attempt``.  ``computed``
     means that the layer is computed, which may take long.  ``link_bytes`` is what it fetches from a remote
-    origin.  ``losses`` counts loaders that were lost through no fault of this load.
+    origin, once that has been found out: while it waits for the link, and while it runs.  ``losses`` counts
+    loaders that were lost through no fault of this load.
     """
 
     key: Key
@@ -111,6 +112,11 @@ class Load:
         return self.attempt is not None
 
     @property
+    def kind(self) -> int:
+        """What it takes besides memory: bit 0, a worker that computes layers; bit 1, the link."""
+        return self.computed | (self.link_bytes > 0) << 1
+
+    @property
     def is_ahead(self) -> bool:
         """Whether no client needs its segment now."""
         return self.work is Purpose.WISH or self.work is Purpose.SPARE
@@ -121,14 +127,15 @@ _Heap = list[tuple[float, int, Load]]
 
 @dataclass(eq=False, slots=True)
 class _Asker:
-    """One asker's loads by priority, computed layers in the second heap.
+    """One asker's loads by priority, a heap for each kind.
 
-    ``clock_s`` is the loader time it has used, ``running`` the number of its loads under way.
+    ``clock_s`` is the loader time it has used, ``running`` the number of its loads under way.  ``best`` says
+    for each load's number which entry counts: its priority, and the heap.
     """
 
     clock_s: float
-    heaps: tuple[_Heap, _Heap] = field(default_factory=lambda: ([], []))
-    best: dict[int, float] = field(default_factory=dict)
+    heaps: tuple[_Heap, ...] = field(default_factory=lambda: ([], [], [], []))
+    best: dict[int, tuple[float, int]] = field(default_factory=dict)
     running: int = 0
 
 
@@ -161,11 +168,17 @@ class LoadQueue:
         mine = self._askers.get(asker)
         if mine is None:
             mine = self._askers[asker] = _Asker(self._clock_s)
-        known = mine.best.get(load.number)
-        if known is None or priority < known:
+        known, kind = mine.best.get(load.number), load.kind
+        if known is None or priority < known[0] or kind != known[1]:
             self.changes += 1
-            mine.best[load.number] = priority
-            heapq.heappush(mine.heaps[load.computed], (priority, load.number, load))
+            mine.best[load.number] = priority, kind
+            heapq.heappush(mine.heaps[kind], (priority, load.number, load))
+
+    def change_kind(self, load: Load) -> None:
+        """Let a queued load, whose kind is another one now, keep its places."""
+        for asker, mine in self._askers.items():
+            if load.number in mine.best:
+                self.push(load, mine.best[load.number][0], asker)
 
     def discard(self, load: Load) -> None:
         """Remove a load from the queue."""
@@ -190,15 +203,20 @@ class LoadQueue:
             payer.running -= 1
             payer.clock_s += spent_s - estimate_s
 
-    def choose(self, *, points: bool = True, layers: bool = True) -> Load | None:
-        """Choose the next load among points, computed layers, or both; None if there is none."""
+    def choose(self, *, points: bool = True, layers: bool = True, link: bool = True) -> Load | None:
+        """Choose the next load among points, computed layers, or both; None if there is none.
+
+        Without ``link`` those that are known to wait for it are passed over.
+        """
         best: tuple[bool, float, float, int] | None = None
         found: Load | None = None
         for asker, mine in list(self._askers.items()):
             self._clean(mine)
             if not any(mine.heaps) and self._is_square(mine):
                 del self._askers[asker]
-            for heap, wanted in zip(mine.heaps, (points, layers), strict=True):
+            for heap, wanted in zip(
+                mine.heaps, (points, layers, points and link, layers and link), strict=True
+            ):
                 if heap and wanted:
                     priority, number, load = heap[0]
                     rank = (priority >= BACKGROUND, mine.clock_s, priority, number)
@@ -228,16 +246,17 @@ class LoadQueue:
 
     def _clean(self, mine: _Asker) -> None:
         """Drop loads no longer queued from the front, and from everywhere once they are the majority."""
-        for heap in mine.heaps:
-            while heap and heap[0][1] not in self._loads:
-                mine.best.pop(heapq.heappop(heap)[1], None)
+        for kind, heap in enumerate(mine.heaps):
+            while heap and (mine.best.get(heap[0][1]) != (heap[0][0], kind) or heap[0][1] not in self._loads):
+                priority, number, _load = heapq.heappop(heap)
+                if mine.best.get(number) == (priority, kind):
+                    del mine.best[number]
         if sum(map(len, mine.heaps)) > 2 * len(self._loads) + 64:
-            mine.best = {number: p for number, p in mine.best.items() if number in self._loads}
+            mine.best = {number: best for number, best in mine.best.items() if number in self._loads}
             for heap in mine.heaps:
                 heap.clear()
-            for number, priority in mine.best.items():
-                load = self._loads[number]
-                heapq.heappush(mine.heaps[load.computed], (priority, number, load))
+            for number, (priority, kind) in mine.best.items():
+                heapq.heappush(mine.heaps[kind], (priority, number, self._loads[number]))
 
 
 class Loads:
@@ -342,9 +361,13 @@ class Loads:
         load = self.by_key.get(key)
         return load is not None and not isinstance(load.work, FailedFileCheck)
 
-    def choose(self, *, points: bool = True, layers: bool = True) -> Load | None:
-        """Choose the nearest load of the asker whose turn it is, of the kinds that a worker can take now."""
-        return self._queue.choose(points=points, layers=layers)
+    def choose(self, *, points: bool = True, layers: bool = True, link: bool = True) -> Load | None:
+        """Choose the nearest load of the asker whose turn it is, of the kinds that can start now."""
+        return self._queue.choose(points=points, layers=layers, link=link)
+
+    def wait_for_link(self, load: Load) -> None:
+        """Let a queued load, whose ``link_bytes`` are known now, wait for the link; others may pass it."""
+        self._queue.change_kind(load)
 
     def bytes_behind(self) -> int:
         """Return the bytes of some loads that follow the one `choose` has chosen."""
@@ -385,6 +408,7 @@ class Loads:
             load.attempt = None
             if self._link is not None:
                 self._link.end(load)
+        load.link_bytes = 0
 
     def finish(self, load: Load, failure: Failure | None = None) -> None:
         """End a load; a ``failure`` stays until a load of the key succeeds or it is cleared."""

@@ -322,7 +322,11 @@ class Scheduler:
         if self.room.waited_for and self.room.still_waited_for(len(self._jobs), now_s):
             return HandOut.WAITS
         points, layers = self.pool.has_room(computed=False), self.pool.has_room(computed=True)
-        load = self.loads.choose(points=points, layers=layers) if points or layers else None
+        if not (points or layers):
+            return HandOut.WAITS
+        load = self.loads.choose(points=points, layers=layers)
+        if load is not None and load.link_bytes and not self._may_fetch(load, now_s):
+            load = self.loads.choose(points=points, layers=layers, link=False)  # what needs none goes on
         if load is None:
             return HandOut.WAITS
         index = self._cache.index_of(load.key.cell_id)
@@ -357,7 +361,8 @@ class Scheduler:
         if self._needed_bytes is not None and isinstance(job, Job):
             load.link_bytes = self._needed_bytes(job)
         if not self._may_fetch(load, now_s):
-            return HandOut.WAITS
+            self.loads.wait_for_link(load)
+            return HandOut.SETTLED
         self.loads.start(load, attempt)
         self._job_numbers += 1
         is_wish = load.work is Purpose.WISH

@@ -19,6 +19,7 @@ from typing import Any
 
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.loading.link import Link
+from shmmap.daemon.loading.worker_messages import Job
 from shmmap.daemon.map_in_memory import FetchedFrom, MapInMemory
 from shmmap.daemon.pins.watch import PinWatch
 from shmmap.daemon.requests.cell_requests import CellRequests
@@ -63,7 +64,8 @@ def finish(work: Iterator[None] | None) -> None:
 class InnerDaemon:
     """What the daemon has in memory, and requests over one map; ``offset_s`` moves its clock ahead.
 
-    With a ``link``, each job that reads a cell uses it, although the cells are files.
+    With a ``link``, each job that reads a cell uses it, although the cells are files; those in ``on_disk`` do
+    not.
     """
 
     def __init__(
@@ -97,7 +99,8 @@ class InnerDaemon:
         self.offset_s = 0.0
         self.stopped_at_s: float | None = None
         pins = PinWatch(self.directory, events=True)
-        fetched = FetchedFrom((), 1, link, lambda job: 0 if job.points else FETCHED_BYTES) if link else None
+        self.on_disk: set[str] = set()
+        fetched = FetchedFrom((), 1, link, self._needed_bytes) if link else None
         self.memory = memory = MapInMemory(
             config, self.origin.load(), self.directory, pins, "", 0o400, -1, None, fetched, clock=self.now_s
         )
@@ -135,6 +138,9 @@ class InnerDaemon:
     def _answer(self, _connection: Connection, answer: Iterator[None]) -> None:
         """An answer is due, in the next turn; kept while `hold_answers`."""
         self.due.append(answer)
+
+    def _needed_bytes(self, job: Job) -> int:
+        return 0 if job.points or Path(job.cell_id).name in self.on_disk else FETCHED_BYTES
 
     def ask(self, session: Session, message: Area | Differential | Selected) -> None:
         """Begin to serve a request for cells, and do what of it needs no waiting."""

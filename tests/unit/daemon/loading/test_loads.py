@@ -130,6 +130,25 @@ def test_points_pass_layers_that_no_loader_can_take() -> None:
     assert queue.choose() is layer
 
 
+def test_what_needs_no_link_passes_what_waits_for_it() -> None:
+    """Which keeps its place, of each asker."""
+    queue = LoadQueue()
+    first, fetched, free = load(), load(), load()
+    queue.push(first, 0.0, "a")
+    queue.push(fetched, 1.0, "a")
+    queue.push(fetched, 2.0, "b")
+    queue.push(free, 3.0, "a")
+    for one in (fetched, first):
+        one.link_bytes = 4096
+        queue.change_kind(one)
+    assert queue.choose(link=False) is free
+    queue.discard(free)
+    assert queue.choose(link=False) is None
+    assert start(queue) is first
+    assert start(queue) is fetched
+    assert queue.choose() is None
+
+
 def test_what_no_request_waits_for_comes_last() -> None:
     queue = LoadQueue()
     check, asked = load(0), load()
@@ -142,7 +161,9 @@ def test_what_no_request_waits_for_comes_last() -> None:
 @given(
     st.lists(
         st.tuples(
-            st.sampled_from(["push", "again", "start", "discard"]), st.integers(0, 3), st.integers(0, 99)
+            st.sampled_from(["push", "again", "link", "start", "discard"]),
+            st.integers(0, 3),
+            st.integers(0, 99),
         )
     )
 )
@@ -158,6 +179,9 @@ def test_everything_comes_once_and_nearest_first_of_each(steps: list[tuple[str, 
         elif what == "again":
             queue.push(chosen, number, asker)
             waiting[chosen][asker] = min(number, waiting[chosen].get(asker, number))
+        elif what == "link":
+            chosen.link_bytes = 0 if chosen.link_bytes else 4096
+            queue.change_kind(chosen)
         elif what == "discard":
             queue.discard(chosen)
             del waiting[chosen]

@@ -5,10 +5,13 @@ from __future__ import annotations
 
 import os
 import signal
+from pathlib import Path
+from typing import Any
 
 import pytest
 
 from shmmap.daemon.loading.link import STALLED_S, Link
+from shmmap.daemon.loading.loads import Load
 from shmmap.daemon.map.arrivals import Arrivals
 from shmmap.layers.points import LAYER
 from shmmap.protocol.messages import Selected
@@ -45,6 +48,43 @@ def test_a_demand_begins_when_the_link_is_silent_or_has_room(waiting: InnerDaemo
     link.end(OTHER)
     assert names(one.cells_of(1)) == [CELL]
     assert link.under_way_bytes == 0
+
+
+def test_what_is_on_the_disk_passes_what_waits_for_the_link(waiting: InnerDaemon) -> None:
+    """Whatever number of cells waits, which are nearest first when the link has room."""
+    one, link = waiting, waiting.scheduler.link
+    assert link is not None
+    near, *others = "0_0.pcd", "0_20.pcd", "20_0.pcd", "20_20.pcd"
+    one.on_disk = {others[-1]}
+    one.ask(one.session(), Selected(1, (near, *others), wait=600.0))
+    one.ask(one.session(), Selected(2, (others[-1],), wait=600.0))
+    assert names(one.cells_of(2)) == [others[-1]]
+    assert not any(load.is_running for load in one.loads.by_key.values())
+    assert 0.0 < sleeps_s(one) <= STALLED_S
+    started: list[str] = []
+    begin = link.begin
+
+    def begun(load: Load, *more: Any) -> None:
+        started.append(load.key.cell_id)
+        begin(load, *more)
+
+    link.begin = begun  # type: ignore[method-assign, assignment]
+    link.end(OTHER)
+    assert names(one.cells_of(1)) == [near, *others]
+    assert [Path(cell).name for cell in started] == [near, *others[:-1]]
+
+
+def test_what_a_lost_loader_was_to_fetch_may_have_come_to_the_disk(waiting: InnerDaemon) -> None:
+    one, link = waiting, waiting.scheduler.link
+    assert link is not None
+    one.ask(one.session(), Selected(1, (CELL,), wait=600.0))
+    one.turn()
+    (load,) = one.loads.by_key.values()
+    assert load.link_bytes == FETCHED_BYTES
+    one.on_disk = {CELL}
+    one.loads.requeue(load)
+    assert names(one.cells_of(1)) == [CELL]
+    assert link.under_way_bytes == WIDE
 
 
 def test_nothing_is_waited_for_once_the_load_has_gone(waiting: InnerDaemon) -> None:
