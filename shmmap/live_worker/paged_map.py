@@ -339,17 +339,17 @@ class PagedMap:
         residency = self.residency
         for chunk, scan in residency.ready()[:CHUNKS_PER_TURN]:
             self._apply(chunk, scan, now_s, now_ns)
-        while (gone := residency.next_eviction(now_s)) is not None:  # now there is memory for others
+        while (gone := residency.evict_next(now_s)) is not None:  # now there is memory for others
             self.memory.give_up(self.chunks.pop(gone.key))
             self._observer.chunk_gone(gone.key)
         jobs = []
-        while (cold := residency.next_load(now_s)) is not None:
+        while (cold := residency.begin_load(now_s)) is not None:
             self._generation += 1
             identity = self.identity(cold.key, self._generation)
             jobs.append(Job(partial(self._load, identity), partial(self._loaded, cold)))
         self._threads.start(jobs)
         jobs = []
-        while (dirty := residency.next_save(now_s, everything=save_all)) is not None:
+        while (dirty := residency.begin_save(now_s, everything=save_all)) is not None:
             view = self.chunks[dirty.key].view
             copy = ChunkView(bytes(view.data[: chunk_bytes(int(view.state["bricks"]))]))
             saved = partial(self._saved, dirty, dirty.version)

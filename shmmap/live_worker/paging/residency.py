@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Decide which chunks of a live map to load, change, save and evict, and in which order.
 
-Pure decisions: clock and sizes are injected.  The owner of the memory asks for the next step (`next_load`,
-`ready`, `next_save`, `next_eviction`), carries it out, and reports that.
+Pure decisions: clock and sizes are injected.  The owner of the memory asks to begin a step (`begin_load`,
+`ready`, `begin_save`, `evict_next`), carries it out, and reports that.
 
 - A chunk is loaded because a scan waits for it, or because it is near a client.  It stays until its memory is
   needed.  For a chunk near a client, only chunks near no client are evicted; for a scan, any chunk, the
@@ -316,25 +316,25 @@ class Residency:
     def _size(self, key: ChunkKey) -> int:
         return self._sizes.get(key, self._new_bytes)
 
-    def next_load(self, now_s: float) -> Chunk | None:
-        """Return the chunk to load next: one that a scan waits for, else the nearest to a client."""
+    def begin_load(self, now_s: float) -> Chunk | None:
+        """Begin to load a chunk: one that a scan waits for, else the nearest to a client."""
         if self.loading >= self.limits.loads:
             return None
         kept_bytes = sum(chunk.missing_bytes for chunk in self._needing.values())  # memory was freed for them
         for chunk in self._needing.values():
             if self._can_load(chunk, now_s) and self._fits(self._size(chunk.key) + kept_bytes, 1):
-                return self._begin_load(chunk)
+                return self._note_loading(chunk)
         if self._missing and now_s >= self._near_s and self._short(now_s) is not _Short.SCANS:
             key = self._missing.nearest()
             if self._fits(self._size(key) + kept_bytes, 1):
                 self._missing.discard(key)
-                return self._begin_load(self._want(key))
+                return self._note_loading(self._want(key))
         return None
 
     def _can_load(self, chunk: Chunk, now_s: float) -> bool:
         return chunk.state is State.LOADING and not chunk.in_progress and chunk.retry_s <= now_s
 
-    def _begin_load(self, chunk: Chunk) -> Chunk:
+    def _note_loading(self, chunk: Chunk) -> Chunk:
         chunk.in_progress = True
         self._resize(chunk, self._size(chunk.key), 0)
         self.loading += 1
@@ -463,8 +463,8 @@ class Residency:
             (_Rank(*rank), found[at]) for rank, at in zip(ranks, first.tolist(), strict=True)
         ]
 
-    def next_save(self, now_s: float, *, everything: bool = False) -> Chunk | None:
-        """Return the chunk to save now: one to be evicted, else one that is due, or any."""
+    def begin_save(self, now_s: float, *, everything: bool = False) -> Chunk | None:
+        """Begin to save a chunk: one to be evicted, else one that is due, or any."""
         if self.saving >= self.limits.saves or now_s < self._save_s:
             return None
         due_s = math.inf if everything else now_s - self._save_after_s
@@ -534,8 +534,8 @@ class Residency:
 
     # --- eviction ------------------------------------------------------------------------------
 
-    def next_eviction(self, now_s: float) -> Chunk | None:
-        """Return the saved chunk to evict now; its memory counts as free."""
+    def evict_next(self, now_s: float) -> Chunk | None:
+        """Evict a saved chunk, if that is needed: its memory counts as free."""
         chunk = self._next_victim(now_s, State.CLEAN)
         if chunk is None:
             return None

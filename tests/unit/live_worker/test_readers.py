@@ -139,7 +139,7 @@ def test_chunks_that_are_being_loaded_are_listed(served: Served) -> None:
     bring(served, there, 2)
     before = served.map.changes.number
     paged.residency.add(Scan(1, 1, 10, {coming}))
-    assert paged.residency.next_load(0.0) is not None
+    assert paged.residency.begin_load(0.0) is not None
     found = {ChunkKey(*row.key): (row.state, row.generation, row.bytes) for row in page(served).rows}
     assert found == {there: ("clean", 2, HEADER_BYTES), coming: ("loading", 0, HEADER_BYTES)}
     assert not page(served, since=before).rows

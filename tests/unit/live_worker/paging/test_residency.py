@@ -23,7 +23,7 @@ def scan_of(*keys: ChunkKey, number: int = 1, nbytes: int = 10) -> Scan:
 
 def load(one: Residency, now_s: float = 0.0, **content: int) -> Chunk:
     """Load what comes next."""
-    chunk = one.next_load(now_s)
+    chunk = one.begin_load(now_s)
     assert chunk is not None
     one.loaded(chunk, version=content.get("version", 0), nbytes=content.get("nbytes", 10), active=0)
     return chunk
@@ -69,7 +69,7 @@ def test_a_client_has_the_chunks_around_it_the_nearest_first() -> None:
     one = Residency(Limits(10**9, radius=1, loads=100))
     one.move("a", (0.5, 0.5, 0.5))
     order = []
-    while (chunk := one.next_load(0.0)) is not None:
+    while (chunk := one.begin_load(0.0)) is not None:
         order.append(chunk.key.distance(HERE))
     assert order == [0, *[1] * 26]
 
@@ -100,20 +100,20 @@ def test_a_window_follows_with_hysteresis(
 def test_only_what_is_near_no_client_makes_room_for_what_is_near() -> None:
     one = Residency(Limits(27 * 10, radius=1, hysteresis=0.0, loads=100), new_bytes=10)
     one.move("a", (0.5, 0.5, 0.5))
-    while (chunk := one.next_load(0.0)) is not None:
+    while (chunk := one.begin_load(0.0)) is not None:
         one.loaded(chunk, version=0, nbytes=10, active=0)
     one.move("a", (1.5, 0.5, 0.5))
     gone, come = set(), set()
     for _ in range(9):
-        assert one.next_load(1.0) is None
-        victim = one.next_eviction(1.0)
+        assert one.begin_load(1.0) is None
+        victim = one.evict_next(1.0)
         assert victim is not None
-        assert one.next_eviction(1.0) is None, "no more than is needed"
+        assert one.evict_next(1.0) is None, "no more than is needed"
         gone.add(victim.key)
         come.add(load(one, 1.0).key)
     assert ({key.x for key in gone}, {key.x for key in come}) == ({-1}, {2})
-    assert one.next_eviction(2.0) is None
-    assert one.next_load(2.0) is None
+    assert one.evict_next(2.0) is None
+    assert one.begin_load(2.0) is None
 
 
 # --- saving -------------------------------------------------------------------------------------
@@ -127,11 +127,11 @@ def test_a_change_is_saved_in_time_the_oldest_first() -> None:
         one.move(number, (number + 0.5, 0.5, 0.5))
         chunks.append(written(one, ChunkKey(number, 0, 0), float(number)))
     in_time = PLENTY.checkpoint_s - TOGETHER_S  # it is durable when it was flushed
-    assert one.next_save(in_time - 0.1) is None
+    assert one.begin_save(in_time - 0.1) is None
     assert one.next_event_s(in_time - 0.1) == in_time
-    assert one.next_save(in_time) is chunks[0]
-    assert one.next_save(in_time) is None
-    assert one.next_save(in_time, everything=True) is chunks[1]
+    assert one.begin_save(in_time) is chunks[0]
+    assert one.begin_save(in_time) is None
+    assert one.begin_save(in_time, everything=True) is chunks[1]
 
 
 def test_durable_is_what_was_flushed() -> None:
@@ -143,7 +143,7 @@ def test_durable_is_what_was_flushed() -> None:
     assert first.applied
     assert not first.durable
     for _ in range(2):
-        chunk = one.next_save(0.0, everything=True)
+        chunk = one.begin_save(0.0, everything=True)
         assert chunk is not None
         one.saved(chunk, 1, 0.0)
     assert not one.flush_is_due(0.0), "more may come"
@@ -159,12 +159,12 @@ def test_durable_is_what_was_flushed() -> None:
 def test_a_file_that_cannot_be_read_just_now_is_tried_again(wanted_by: str) -> None:
     one = Residency(PLENTY)
     one.add(scan_of(HERE)) if wanted_by == "scan" else one.move("a", (0.5, 0.5, 0.5))
-    chunk = one.next_load(5.0)
+    chunk = one.begin_load(5.0)
     assert chunk is not None
     one.load_failed(chunk, 5.0)
-    assert one.next_load(5.0 + 0.9 * RETRY_S) is None
+    assert one.begin_load(5.0 + 0.9 * RETRY_S) is None
     assert one.next_event_s(5.0) == 5.0 + RETRY_S
-    again = one.next_load(5.0 + RETRY_S)
+    again = one.begin_load(5.0 + RETRY_S)
     assert again is not None
     assert again.key == HERE
 
@@ -175,11 +175,11 @@ def test_a_file_that_cannot_be_read_just_now_is_tried_again(wanted_by: str) -> N
 def test_clean_chunks_stay_until_their_room_is_needed() -> None:
     one = Residency(PLENTY)
     chunk = written(one, HERE)
-    assert one.next_save(20.0) is chunk
+    assert one.begin_save(20.0) is chunk
     one.saved(chunk, 1, 20.0)
     flush(one)
     for now_s in (20.0, 25.0, 1e6):
-        assert one.next_eviction(now_s) is None
+        assert one.evict_next(now_s) is None
         assert one.next_event_s(now_s) == math.inf, "and nothing looks for what may go"
 
 
@@ -191,7 +191,7 @@ def test_what_no_client_wants_is_given_up_first_furthest_first() -> None:
         chunk = load(one, version=3)
         one.applied(chunk, chunk.waiting[0], version=3, nbytes=10, active=1, now_s=0.0)
     ask_for_room(one)
-    gone = [victim.key.x for _ in range(6) if (victim := one.next_eviction(2.0)) is not None]
+    gone = [victim.key.x for _ in range(6) if (victim := one.evict_next(2.0)) is not None]
     assert gone == [9, 4, 2, 1, 0]
 
 
@@ -204,11 +204,11 @@ def test_a_dirty_chunk_is_saved_to_go_when_no_clean_one_goes_before_it(dirty_x: 
     for x in (4, 5):
         one.adopt(ChunkKey(x, 9, 0), version=1, saved=1, nbytes=10, active=0, now_s=0.0).changed_s = 0.0
     one.add(scan_of(ChunkKey(2, 9, 0), ChunkKey(3, 9, 0), number=7))
-    gone = one.next_eviction(1.0)
+    gone = one.evict_next(1.0)
     assert gone is not None
     assert gone.key.x == 5, "at once, whatever else is to be saved"
     load(one, 1.0)
-    assert one.next_save(1.0) is (dirty if dirty_x > 4 else None)
+    assert one.begin_save(1.0) is (dirty if dirty_x > 4 else None)
 
 
 def test_too_many_known_voxels_are_too_many() -> None:
@@ -216,16 +216,16 @@ def test_too_many_known_voxels_are_too_many() -> None:
     one.move("a", (0.5, 0.5, 0.5))
     for x in (0, 1):
         written(one, ChunkKey(x, 0, 0))
-    assert one.next_save(5.0) is None
+    assert one.begin_save(5.0) is None
     written(one, ChunkKey(-1, 0, 0))
     assert one.active == 3
     now_s = 5.0 + REVIEW_S
-    chunk = one.next_save(now_s)
+    chunk = one.begin_save(now_s)
     assert chunk is not None
     one.saved(chunk, 1, now_s)
-    assert one.next_eviction(now_s) is not None
+    assert one.evict_next(now_s) is not None
     assert one.active == 2
-    assert one.next_eviction(now_s + REVIEW_S) is None
+    assert one.evict_next(now_s + REVIEW_S) is None
 
 
 def test_room_that_was_made_for_one_is_not_another_s() -> None:
@@ -238,8 +238,8 @@ def test_room_that_was_made_for_one_is_not_another_s() -> None:
         load(one)
     assert not one.may_grow(chunk, 15)
     for number in range(2):
-        assert one.next_eviction(5.0) is not None
-        assert one.next_load(5.0) is None, number
+        assert one.evict_next(5.0) is not None
+        assert one.begin_load(5.0) is None, number
     assert one.may_grow(chunk, 15)
     apply(one, chunk, 5.0, grows=15)
     assert one.chunk_bytes == 35
@@ -251,11 +251,11 @@ def test_where_one_file_cannot_be_written_no_other_is_tried_at_once() -> None:
     for x in range(3):
         one.move(x, (x + 0.5, 0.5, 0.5))
         chunks.append(written(one, ChunkKey(x, 0, 0)))
-    assert one.next_save(50.0) is chunks[0]
+    assert one.begin_save(50.0) is chunks[0]
     one.save_failed(chunks[0], 50.0)
-    assert one.next_save(50.0 + RETRY_S / 2) is None
+    assert one.begin_save(50.0 + RETRY_S / 2) is None
     assert one.next_event_s(50.0) == 50.0 + RETRY_S
-    assert one.next_save(50.0 + RETRY_S) is chunks[1]
+    assert one.begin_save(50.0 + RETRY_S) is chunks[1]
 
 
 @pytest.mark.parametrize("fails", [False, True])
@@ -273,14 +273,14 @@ def test_a_scan_without_memory_does_not_hold_up_others(fails: bool) -> None:
     seen = [one.is_ready]
     apply(one, chunks[2])
     seen.append(one.is_ready)
-    assert one.next_eviction(9.0) is None
-    assert one.next_save(9.0) is chunks[2]
-    assert one.next_eviction(9.0) is None
+    assert one.evict_next(9.0) is None
+    assert one.begin_save(9.0) is chunks[2]
+    assert one.evict_next(9.0) is None
     if fails:
         one.save_failed(chunks[2], 9.0)
     else:
         one.saved(chunks[2], chunks[2].version, 9.0)
-    gone = one.next_eviction(9.0 + REVIEW_S)
+    gone = one.evict_next(9.0 + REVIEW_S)
     assert gone in chunks[:2] if fails else gone is chunks[2]
     seen.append(one.is_ready)
     assert seen == [True, False, True], "there is room now"
@@ -291,14 +291,14 @@ def test_a_chunk_near_a_client_that_a_scan_needed_the_room_of_comes_back_later()
     one.move("a", (0.5, 0.5, 0.5))
     load(one)
     one.add(scan_of(ChunkKey(9, 0, 0)))
-    assert one.next_eviction(0.0) is not None
+    assert one.evict_next(0.0) is not None
     far = load(one)
     apply(one, far)
-    one.saved(far, far.version, 0.0) if one.next_save(10.0) is far else pytest.fail("it is due")
+    one.saved(far, far.version, 0.0) if one.begin_save(10.0) is far else pytest.fail("it is due")
     flush(one)
-    assert one.next_eviction(0.1) is None, "what is near comes back later"
+    assert one.evict_next(0.1) is None, "what is near comes back later"
     assert one.next_event_s(0.1) == RETRY_S
-    assert one.next_eviction(10.0) is far
+    assert one.evict_next(10.0) is far
     assert load(one, 10.0).key == HERE
 
 
@@ -313,11 +313,11 @@ def test_where_memory_is_short_no_scan_waits_for_the_next_review() -> None:
         scan = scan_of(*keys, number=number + 1)
         one.add(scan)
         for _ in range(20):
-            while (dirty := one.next_save(0.0)) is not None:
+            while (dirty := one.begin_save(0.0)) is not None:
                 one.saved(dirty, dirty.version, 0.0)
-            while one.next_eviction(0.0) is not None:
+            while one.evict_next(0.0) is not None:
                 pass
-            while (chunk := one.next_load(0.0)) is not None:
+            while (chunk := one.begin_load(0.0)) is not None:
                 one.loaded(chunk, version=0, nbytes=10, active=0)
             for ready, _ in one.ready():
                 apply(one, ready)
@@ -331,7 +331,7 @@ def test_giving_up_is_not_a_search_each_time() -> None:
         one.adopt(ChunkKey(number, 0, 0), version=1, saved=1, nbytes=10, active=0, now_s=0.0)
     ask_for_room(one)
     with counted_calls() as calls:
-        gone = sum(one.next_eviction(float(now_s)) is not None for now_s in range(1, 100) for _ in range(50))
+        gone = sum(one.evict_next(float(now_s)) is not None for now_s in range(1, 100) for _ in range(50))
     assert gone == 2000
     assert calls.count <= 100 * 2000
 
@@ -344,9 +344,9 @@ def test_a_client_that_moves_costs_no_look_at_all_chunks() -> None:
     one.move("a", (2.5, 0.5, 0.5))
     with counted_calls() as calls:
         one.move("a", (3.5, 0.5, 0.5))
-        one.next_load(1.0)
-        one.next_save(1.0)
-        one.next_eviction(1.0)
+        one.begin_load(1.0)
+        one.begin_save(1.0)
+        one.evict_next(1.0)
     assert calls.count <= 1000
 
 
