@@ -33,14 +33,20 @@ def serve_main() -> NoReturn:
 
 def _run(words: Sequence[str]) -> NoReturn:
     """Run a verb as this process; see `shmmap.processes.request_threads.leave`."""
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        signal.signal(signal.SIGINT, signal.SIG_DFL)  # until the verb runs: an import would print a traceback
+    _be_ended_by_interrupts()  # until the verb runs
     from shmmap.cli.entry import main as run_verb
 
     try:
         code: object = run_verb(words)
     except SystemExit as ended:
         code = ended.code or 0
+    _be_ended_by_interrupts()
     if (threads := sys.modules.get("shmmap.processes.request_threads")) is not None:
         threads.leave(code)
     sys.exit(code)  # type: ignore[arg-type]
+
+
+def _be_ended_by_interrupts() -> None:
+    """Let Ctrl-C end this process at once: while modules are imported, and at exit, Python would print it."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)

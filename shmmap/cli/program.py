@@ -5,13 +5,14 @@ from __future__ import annotations
 
 import _signal as signal  # type: ignore[import-not-found]  # `signal` takes 2 ms to import
 import argparse
+import contextlib
 import errno
 import io
 import os
 import re
 import sys
 import warnings
-from collections.abc import Callable, Container, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any, Final, NoReturn, TextIO
@@ -110,11 +111,11 @@ def exit_code_of(name: str, run: Callable[[], int]) -> int:
     """Run a program and return its exit code; print its errors on stderr."""
     _open_what_is_closed()
     _write_all_letters()
-    keep_interrupts()
     watch(CompilingLines(name))
     _show_warnings(name)
     try:
-        code = _flushed(run)
+        with interrupts_kept():
+            code = _flushed(run)
     except ShmmapError as error:
         complain(name, error.message, error.hint)
         return error.exit_code
@@ -122,12 +123,8 @@ def exit_code_of(name: str, run: Callable[[], int]) -> int:
         _drop_output()
         return _EXIT_BROKEN_PIPE
     except KeyboardInterrupt:
-        _forget_interrupt()
         return _EXIT_INTERRUPTED
     except Exception as error:  # noqa: BLE001
-        if _is_of_interrupt(error):
-            _forget_interrupt()
-            return _EXIT_INTERRUPTED
         if isinstance(error, OSError) and error.errno == errno.EIO and error.filename is None:
             _drop_output()  # of a terminal that is gone
             return _EXIT_BROKEN_PIPE
@@ -199,24 +196,6 @@ def _show_warnings(name: str) -> None:
     warnings.showwarning = show
 
 
-def _forget_interrupt() -> None:
-    """Clear CPython's record of an interrupt, so that the exit code counts.
-
-    CPython records that an interrupt reached `exec` of a text, which dataclasses use during imports.  At exit
-    ``python -m`` would then end by SIGINT although the interrupt was caught.  Another `exec` clears the
-    record.
-    """
-    exec("")  # noqa: S102
-
-
-def _is_of_interrupt(error: BaseException) -> bool:
-    """Whether an error arose during cleanup after an interrupt in the middle of a call."""
-    context: BaseException | None = error
-    while context is not None and not isinstance(context, KeyboardInterrupt):
-        context = context.__context__
-    return context is not None
-
-
 def _open_what_is_closed() -> None:
     """Redirect to the null device stdout and stderr that were closed when this process was started."""
     for name in ("stdout", "stderr"):
@@ -259,33 +238,41 @@ def nothing_found(args: argparse.Namespace, message: str, hint: str = "", *, nam
     return 0 if args.allow_empty else 1
 
 
-def keep_interrupts() -> None:
+@contextlib.contextmanager
+def interrupts_kept() -> Iterator[None]:
     """Repeat interrupts and exits that Python would ignore (`KeyboardInterrupt`, `SystemExit`).
 
     Raised in a weak reference's callback or in a finalizer, they only make Python print "Exception ignored
-    in". This happens to one in ten interrupts during imports
-    (https://github.com/python/cpython/issues/95959).
+    in", and the program goes on (https://github.com/python/cpython/issues/95959).  Each import ends with such
+    a callback, and verbs import much when they run: it happened to one of 40 interrupts at random moments of
+    ``tail``, and to one of 40 at random calls of ``divide``.
     """
-    before = sys.unraisablehook
+    before, number = sys.unraisablehook, 0
 
     def ignored(what: Any) -> None:
+        nonlocal number
         if not issubclass(what.exc_type, KeyboardInterrupt | SystemExit):
             before(what)
             return
         number = signal.SIGINT if issubclass(what.exc_type, KeyboardInterrupt) else signal.SIGTERM
-
-        def again(_alarm: int, frame: FrameType | None) -> None:
-            while frame is not None and frame.f_code is not ignored.__code__:
-                frame = frame.f_back
-            if frame is None:
-                signal.raise_signal(number)
-            else:  # raised here, it would be lost
-                signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
-
         signal.signal(signal.SIGALRM, again)
         signal.setitimer(signal.ITIMER_REAL, _LATER_S)
 
+    def again(_alarm: int, frame: FrameType | None) -> None:
+        while frame is not None and frame.f_code is not ignored.__code__:
+            frame = frame.f_back
+        if frame is None:
+            signal.raise_signal(number)
+        else:  # raised here, it would be lost
+            signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
+
     sys.unraisablehook = ignored
+    try:
+        yield
+    finally:
+        sys.unraisablehook = before
+        if number:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)  # at the interpreter's end it would kill the process
 
 
 def output_file(text: str) -> Path:

@@ -43,10 +43,6 @@ def fail_with(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
     monkeypatch.setattr(about, "run_version", run)
 
 
-AFTER_CTRL_C = ValueError("it cannot be closed now")
-AFTER_CTRL_C.__context__ = KeyboardInterrupt()
-
-
 @pytest.mark.parametrize(
     ("error", "code", "said"),
     [
@@ -56,7 +52,6 @@ AFTER_CTRL_C.__context__ = KeyboardInterrupt()
         ),
         (errors.MapMissing("no map at /nowhere"), 66, "shmmap: no map at /nowhere\n"),
         (KeyboardInterrupt(), 130, ""),
-        (AFTER_CTRL_C, 130, ""),
     ],
 )
 def test_exit_codes_of_the_contract(
@@ -66,7 +61,6 @@ def test_exit_codes_of_the_contract(
     monkeypatch: pytest.MonkeyPatch,
     verb: Verb,
 ) -> None:
-    """What goes wrong while cleaning up after Ctrl-C is no defect."""
     fail_with(monkeypatch, error)
     assert verb(["version"], code) == ("", said)
 
@@ -85,16 +79,6 @@ def test_a_defect_shows_its_traceback_and_asks_to_report(monkeypatch: pytest.Mon
     assert "Traceback" in said
     assert "shmmap: internal error: ZeroDivisionError: oops\nhint: " in said
     assert "report" in said.splitlines()[-1]
-
-
-def test_ctrl_c_within_exec_is_an_exit_code(tmp_path: Path) -> None:
-    """As while a dataclass is made."""
-    (tmp_path / "interrupted.py").write_text(
-        "import sys\nfrom shmmap.cli.program import exit_code_of\n"
-        "sys.exit(exit_code_of('shmmap', lambda: exec('raise KeyboardInterrupt')))\n"
-    )
-    done = subprocess.run([sys.executable, "-m", "interrupted"], cwd=tmp_path, capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (130, "")
 
 
 def test_a_reader_that_went_away_is_no_error() -> None:

@@ -75,7 +75,7 @@ def test_what_is_held_back_comes_after_the_block_also_when_it_fails() -> None:
 
 PROGRAM = """\
 import os, signal, sys, time, weakref
-from shmmap.cli.program import keep_interrupts
+from shmmap.cli.program import interrupts_kept
 
 class Thing:
     def __del__(self):
@@ -94,18 +94,18 @@ def dictionary():
     one = found[1] = Thing()
     return found, one
 
-keep_interrupts()
 number = signal.SIGTERM if "stop" in sys.argv else signal.SIGINT
 signal.signal(signal.SIGTERM, stop)
-for _ in range(2 if "twice" in sys.argv else 1):
-    try:
-        thing = Thing()
-        watched = weakref.ref(thing, callback)
-        del thing
-        os.write(1, b"ignored ")
-        time.sleep(30)
-    except (KeyboardInterrupt, SystemExit) as error:
-        os.write(1, type(error).__name__.encode() + b" ")
+with interrupts_kept():
+    for _ in range(2 if "twice" in sys.argv else 1):
+        try:
+            thing = Thing()
+            watched = weakref.ref(thing, callback)
+            del thing
+            os.write(1, b"ignored ")
+            time.sleep(30)
+        except (KeyboardInterrupt, SystemExit) as error:
+            os.write(1, type(error).__name__.encode() + b" ")
 """
 
 
@@ -130,6 +130,28 @@ def test_what_was_ignored_comes_again(where: str, what: str, times: str, machine
     assert done.stderr == ""
 
 
+AT_THE_END = """\
+import signal
+from shmmap.cli import program
+program._LATER_S = 60.0
+
+class Thing:
+    def __del__(self):
+        signal.raise_signal(signal.SIGINT)
+
+with program.interrupts_kept():
+    Thing()
+    assert signal.getitimer(signal.ITIMER_REAL)[0] > 0
+assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+"""
+
+
+def test_what_was_ignored_last_does_not_come_at_the_interpreters_end() -> None:
+    """No handler would be there any more, and the alarm end the process."""
+    done = subprocess.run([sys.executable, "-c", AT_THE_END], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_other_exceptions_are_reported_as_before() -> None:
     program = PROGRAM.replace("signal.raise_signal(number)", "raise ValueError('odd')").replace("30", "0")
     done = subprocess.run(
@@ -138,16 +160,20 @@ def test_other_exceptions_are_reported_as_before() -> None:
     assert "ValueError: odd" in done.stderr
 
 
-IN_AN_IMPORT = """\
-import signal, sys
+AT_A_MOMENT = """\
+import atexit, signal, sys
 from shmmap.cli import main
+
+moment = sys.argv[1]
 
 class At:
     def find_spec(self, name, *_):
-        if name == "shmmap.cli.verbs.look.status":
+        if name == moment:
             signal.raise_signal(signal.SIGINT)
 
 sys.meta_path.insert(0, At())
+if moment == "exit":
+    atexit.register(signal.raise_signal, signal.SIGINT)
 if "ignored" in sys.argv:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 sys.argv = ["shmmap", "status", "--help"]
@@ -155,12 +181,13 @@ main()
 """
 
 
-def test_ctrl_c_while_a_verb_is_imported_says_nothing() -> None:
-    """Python would print a traceback of imports; where a shell has it ignored, it stays so."""
-    done = subprocess.run([sys.executable, "-c", IN_AN_IMPORT], capture_output=True, text=True, timeout=60)
-    assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, "", "")
-    done = subprocess.run(
-        [sys.executable, "-c", IN_AN_IMPORT, "ignored"], capture_output=True, text=True, timeout=60
-    )
+@pytest.mark.parametrize("moment", ["shmmap.cli.entry", "shmmap.cli.verbs.look.status", "exit"])
+def test_ctrl_c_before_and_after_a_verb_says_nothing(moment: str) -> None:
+    """Python would print a traceback; where a shell has it ignored, it stays so."""
+    words = [sys.executable, "-c", AT_A_MOMENT, moment]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (-signal.SIGINT, "")
+    assert bool(done.stdout) == (moment == "exit")
+    done = subprocess.run([*words, "ignored"], capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("usage: shmmap status")
