@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.paging.durability import Chunk, Scan, State
-from shmmap.daemon.live.paging.key_index import EVERYWHERE
-from shmmap.daemon.live.paging.residency import RETRY_S, Limits, Residency
+from shmmap.live_worker.paging.durability import Chunk, Scan, State
+from shmmap.live_worker.paging.key_index import EVERYWHERE
+from shmmap.live_worker.paging.residency import RETRY_S, Limits, Residency
 
 NEW = 10
 MOST = 60
