@@ -266,13 +266,13 @@ class CellCache:
         self.heights.learn(index, resident.z_min, resident.z_max)
         return True
 
-    def serve(self, new: CatalogueView, change: CatalogueChange) -> list[ShardedDict[int, Any]]:
+    def serve(self, new: CatalogueView, change: CatalogueChange) -> list[ShardedDict[int, Any] | object]:
         """Serve another state of the map, of which any number of cells may have changed.
 
         No cell is warm in the new state until `find_warm` or `MapSwitch.run_step` has found it in the ledger.
-        Returned are the tables that are not used any more: freeing many entries at once takes long.
+        Returned are the tables that are not used any more: freeing them takes long.
         """
-        left: list[ShardedDict[int, Any]] = [*self.warm.layers.values(), *self.layers.forget()]
+        left = [self.heights, *self.warm.tables.values(), *self.warm.layers.values(), *self.layers.forget()]
         self.catalogue = new
         self.warm = self.warm.successor()
         if change.same_numbers:

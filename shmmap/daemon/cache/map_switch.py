@@ -18,7 +18,7 @@ from shmmap.segment.version import Stamp
 
 CELLS_REMEMBERED: Final = 2048
 """Changed cells remembered, over all states; for changes before these, clients read the whole list."""
-FEW: Final = 128
+FEW: Final = 64
 FEW_AMONG_OTHERS: Final = 8
 """Changed cells whose segments are found in one step, in about a millisecond; the second number holds if
 there are layers that read neighbouring cells: to find the neighbours takes longer."""
@@ -48,7 +48,7 @@ class MapSwitch:
         self._cache = cache
         self._history: deque[_Changed] = deque(maxlen=CELLS_REMEMBERED)
         self._unseen: Walk[Resident] | None = None
-        self._leftovers: list[ShardedDict[int, Any]] = []
+        self._leftovers: list[ShardedDict[int, Any] | object] = []
         self._to_free: Walk[None] | None = None
 
     def changes_since(self, map_version: int) -> tuple[set[str], list[str]] | None:
@@ -137,28 +137,33 @@ class MapSwitch:
         return 0.0 if self.busy else math.inf
 
     def run_step(self, now_s: float) -> None:
-        """Check some segments: each is current, outdated, or of a cell that left the map."""
+        """Free some unused tables, or check some segments.
+
+        A segment is current, outdated, or of a cell that left the map.  Tables go first: however often the
+        map changes, those of a few states are in memory.
+        """
         cache = self._cache
-        if self._unseen is not None:
+        if self._to_free is not None:
+            for _ in self._to_free.for_a_turn():
+                pass
+            if self._to_free.is_done:
+                self._to_free = None
+        elif self._unseen is not None:
             for resident in self._unseen.for_a_turn():
                 cache.unentered = max(1, cache.unentered - 1)
                 if cache.ledger.resident_named(resident.name) is resident:
                     self._look_at(resident, now_s)
             if self._unseen.is_done:
                 self._unseen, cache.unentered = None, 0
-        elif self._to_free is not None:
-            for _ in self._to_free.for_a_turn():
-                pass
-            if self._to_free.is_done:
-                self._to_free = None
 
     def _free_leftovers(self) -> Iterator[None]:
-        """Free unused tables, one entry per step: freeing many at once takes long."""
+        """Free unused tables, one entry or array per step: freeing more at once takes long."""
         while self._leftovers:
-            if self._leftovers[-1]:
-                self._leftovers[-1].popitem()
-            else:
-                self._leftovers.pop()
+            table = self._leftovers.pop()
+            while isinstance(table, ShardedDict) and table:
+                table.popitem()
+                yield
+            del table
             yield
 
     def _look_at(self, resident: Resident, now_s: float) -> None:

@@ -262,13 +262,12 @@ class Scheduler:
                 self.loads.requeue(load)
         self.prefetcher.restart()
 
-    def _waits_for_pages(self, load: Load, now_s: float) -> bool:
+    def _waits_for_pages(self, load: Load, index: int, now_s: float) -> bool:
         """Whether a load cannot start because the cells it reads are not known yet."""
-        cache, pages = self._cache, self._cache.pages
+        pages = self._cache.pages
         if pages is None or not isinstance(load.work, Purpose):
             return False
-        index = cache.index_of(load.key.cell_id)
-        area = self._layers.looks_into(index, load.key.layer) if index is not None else None
+        area = self._layers.looks_into(index, load.key.layer)
         absent = [] if area is None else [page for page in pages.of_area(area) if not pages.is_here(page)]
         if not absent:
             return False
@@ -338,7 +337,7 @@ class Scheduler:
             if self._ledger.resident_named(resident.name) is not resident:  # it was retired
                 self._load_after_all(load)
                 return HandOut.SETTLED
-        if load.computed and self._waits_for_pages(load, now_s):
+        if load.computed and self._waits_for_pages(load, index, now_s):
             return HandOut.SETTLED
         shortage = self._ledger.shortage(load.estimate) if load.estimate else 0
         if shortage > 0:

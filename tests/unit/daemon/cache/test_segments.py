@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import resource
 from collections.abc import Iterator
@@ -16,6 +17,7 @@ import pytest
 from shmmap.daemon.cache import map_switch, warm_index
 from shmmap.daemon.cache.warm_index import Heights
 from shmmap.daemon.records import Key, Resident
+from shmmap.large_tables import ShardedDict
 from shmmap.protocol import messages as m
 from shmmap.protocol.codec import pack_versions
 from shmmap.protocol.messages import Area, CircleMessage, Differential, Metadata, Selected
@@ -114,7 +116,7 @@ def remove(made: DividedMap, name: str) -> None:
     made.write_metadata()
 
 
-@pytest.mark.parametrize("turns", [0, 1, CELLS // 2, CELLS + 3])
+@pytest.mark.parametrize("turns", [0, 1, CELLS // 2, CELLS + CELLS // 2, 2 * CELLS + 3])
 @pytest.mark.usefixtures("short_turns")
 def test_requests_meanwhile_are_answered_as_if_it_were_over(
     inner: Inner, made: DividedMap, turns: int
@@ -150,6 +152,26 @@ def test_a_change_during_a_change(inner: Inner, made: DividedMap) -> None:
     finish_change(one)
     assert len(one.cache.warm) == one.ledger.resident_count == CELLS - 5
     assert len(one.everything(2).cells) == CELLS - 5
+
+
+@pytest.mark.usefixtures("short_turns")
+def test_tables_of_many_states_do_not_pile_up(inner: Inner, made: DividedMap) -> None:
+    """Also where another state comes before the segments have been checked for the last one."""
+
+    def tables() -> int:
+        return sum(isinstance(one, ShardedDict) for one in gc.get_objects())
+
+    one = inner(str(made.root))
+    one.everything()
+    found = []
+    for name in sorted(made.corners)[:6]:
+        remove(made, name)
+        one.reload()
+        for _ in range(CELLS + 8):
+            one.map_switch.run_step(one.now_s())
+        assert one.cache.unentered > 0
+        found.append(tables())
+    assert max(found) == found[0]
 
 
 def test_very_many_changes_are_not_remembered(
