@@ -90,26 +90,31 @@ def wheel(directory: Path, version: str) -> Path:
     return built
 
 
-def pip_install(machine: BootedSystemd, built: Path) -> None:
+def pip_install(machine: BootedSystemd, built: Path, place: str) -> None:
     """``pip install`` a wheel into the environment of the service."""
-    pip = f"{sys.executable} -m pip --python {PLACE}/bin/python install -q --no-deps --no-index"
+    pip = f"{sys.executable} -m pip --python {place}/bin/python install -q --no-deps --no-index"
     machine.shell(f"unset PYTHONPATH; {pip} /exchange/{built.name} 2>&1")
+
+
+def made_environment(machine: BootedSystemd, place: str) -> None:
+    """Make an environment for the service, with the packages of this one."""
+    packages = sysconfig.get_path("purelib")
+    machine.shell(f"""
+        unset PYTHONPATH
+        {sys.executable} -m venv --without-pip {place}
+        echo {packages} >"$({place}/bin/python -c 'import site; print(site.getsitepackages()[0])')/others.pth"
+    """)
 
 
 @pytest.fixture
 def installed(fresh: BootedSystemd) -> Iterator[BootedSystemd]:
-    """A service of an environment of its own, with the packages of this one."""
+    """A service of an environment of its own."""
     wheels = [wheel(fresh.shared, version) for version in ("0.90.0", "0.91.0")]
-    packages = sysconfig.get_path("purelib")
+    made_environment(fresh, PLACE)
+    pip_install(fresh, wheels[0], PLACE)
     fresh.shell(f"""
         unset PYTHONPATH
-        {sys.executable} -m venv --without-pip {PLACE}
-        echo {packages} >"$({PLACE}/bin/python -c 'import site; print(site.getsitepackages()[0])')/others.pth"
         cp {SETTINGS} /root/settings
-    """)
-    pip_install(fresh, wheels[0])
-    fresh.shell(f"""
-        unset PYTHONPATH
         {PLACE}/bin/shmmap unit install --map {MAP}
         sed -i '1i live_group = "shmmap"' {SETTINGS}
         printf '\n[live.lidar]\nresolution = 0.5\n' >>{SETTINGS}
@@ -153,7 +158,7 @@ def test_an_upgrade_under_running_programs(installed: BootedSystemd) -> None:
     try:
         before = {says(what)[0] for what in programs}
         assert len(before) == 1
-        pip_install(machine, machine.shared / "shmmap-0.91.0-py3-none-any.whl")
+        pip_install(machine, machine.shared / "shmmap-0.91.0-py3-none-any.whl", PLACE)
         done = machine.shell(f"unset PYTHONPATH; {PLACE}/bin/shmmap unit install; {PLACE}/bin/shmmap version")
         assert "next: systemctl restart shmmapd\n" in done
         assert "0.91.0" in done

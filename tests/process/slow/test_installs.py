@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Installs beside what there is: versions side by side, and in an image of another machine's disk."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.process.distributions import tree
+from tests.support.container_root import ContainerRoot, Image
+from tests.support.daemon_process import ROOT
+from tests.support.namespaces import namespaces_or_skip
+from tests.support.pages import Reader, read_page, write_program
+from tests.support.skips import index_or_skip
+
+
+@pytest.fixture
+def clone(tmp_path: Path) -> Path:
+    """A clone of this tree, as it stands on disk."""
+    folder = tmp_path / "shmmap"
+    listed = "\0".join(tree())
+    command = f"tar -C '{ROOT}' --null -T - -cf - | tar -C '{folder}' -xf - && cd '{folder}' && git init -q"
+    folder.mkdir()
+    subprocess.run(["sh", "-c", command], input=listed, text=True, check=True)
+    identity = ["-c", "user.name=test", "-c", "user.email=test@localhost"]
+    for words in (["add", "-A"], [*identity, "commit", "-q", "-m", "all"]):
+        subprocess.run(["git", *words], cwd=folder, check=True)
+    return folder
+
+
+def without_dependencies(text: str) -> dict[str, str]:
+    """Return variables for lines that install everything: here what they depend on is left out."""
+    assert "install" in text
+    return {"PIP_NO_DEPS": "1", "PIP_DISABLE_PIP_VERSION_CHECK": "1"}
+
+
+@pytest.fixture
+def reader(tmp_path: Path) -> Iterator[Reader]:
+    one = Reader(tmp_path, [], without_dependencies("install"))
+    yield one
+    one.leave()
+
+
+def test_versions_side_by_side(reader: Reader, clone: Path, tmp_path: Path) -> None:
+    """The link is switched from one to the other; what was started by the path behind it goes on."""
+    install, switch = read_page("shmmap/INSTALL.md").commands("versions")
+    here = tmp_path / "opt"
+    (here / "shmmap-0.2.0").mkdir(parents=True)
+    (here / "shmmap").symlink_to("shmmap-0.2.0")
+    user = reader.terminal(clone)
+    with index_or_skip():
+        user.run(install.replace("/opt/", f"{here}/"))
+    user.run(switch.replace("/opt/", f"{here}/"))
+    assert [path.name for path in sorted(here.iterdir())] == ["shmmap", "shmmap-0.2.0", "shmmap-0.3.0"]
+    found = reader.terminal().run(f"'{here}/shmmap/bin/python' -c 'import shmmap; print(shmmap.__file__)'")
+    assert found.startswith(str(here))
+
+
+@pytest.mark.root
+def test_an_image_of_a_vehicle_s_disk(clone: Path, tmp_path: Path) -> None:
+    """This machine stands for the image; of the packages it gets what the last line needs."""
+    namespaces_or_skip("--mount", "--pid")
+    (tmp_path / "container").mkdir()
+    try:
+        root = ContainerRoot(tmp_path / "container", Image(), ROOT, [])
+    except OSError as error:
+        pytest.skip(f"no overlay of this machine: {error}")
+    write_program(tmp_path / "sudo", 'exec "$@"')
+    (clone / "image").mkdir()
+
+    def typed(line: str) -> str:
+        environment = {
+            "PATH": f"{tmp_path}:/usr/bin:/bin:/usr/sbin:/sbin",
+            "HOME": str(tmp_path),
+            **without_dependencies("install"),
+        }
+        words = root.on_host(f"cd '{clone}'; {line}", environment)
+        done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=400)
+        assert done.returncode == 0, f"{line}\n{done.stdout}{done.stderr}"
+        return done.stdout
+
+    try:
+        typed(f"mount --bind '{root.root}' image; mkdir -p image/usr/src; rm -rf image/etc/shmmap")
+        copy, install, units = read_page("systemd/README.md").commands("image-program")
+        typed(copy)
+        with index_or_skip():
+            typed(install)
+        typed("chroot image /opt/shmmap/bin/pip install -q msgspec tomli")
+        typed(units)
+        unit = typed("cat image/etc/systemd/system/shmmapd.service")
+        assert "\nExecStart=/opt/shmmap/bin/shmmapd " in unit
+    finally:
+        root.close()
