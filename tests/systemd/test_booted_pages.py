@@ -12,12 +12,12 @@ from collections.abc import Iterator
 
 import pytest
 
+from tests.support.booted_service import make_environment, make_wheel, pip_install
 from tests.support.booted_systemd import BootedSystemd
 from tests.support.daemon_process import ROOT
 from tests.support.pages import read_page
 from tests.support.web_servers import needed_nginx
 from tests.systemd.conftest import MAP, RUN
-from tests.systemd.test_booted_upgrade import made_environment, pip_install, wheel
 
 pytestmark = pytest.mark.root
 
@@ -41,8 +41,8 @@ def operator(fresh: BootedSystemd) -> Iterator[BootedSystemd]:
         ln -sf {PLACE}/bin/shmmap /usr/local/bin/shmmap
         printf '%s' {shlex.quote(SUDO)} >/usr/local/bin/sudo; chmod 755 /usr/local/bin/sudo
     """)
-    built = wheel(fresh.shared, "0.90.0")
-    made_environment(fresh, PLACE)
+    built = make_wheel(fresh.shared, "0.90.0")
+    make_environment(fresh, PLACE)
     pip_install(fresh, built, PLACE)
     yield fresh
     fresh.shell(f"systemctl disable --now shmmapd; rm -rf {PLACE} /var/lib/shmmap/maps")
@@ -100,7 +100,7 @@ def test_the_service_from_its_install_to_its_upgrade(operator: BootedSystemd) ->
         pull,
     )
     typed(operator, "systemctl start shmmapd")
-    pip_install(operator, wheel(operator.shared, "0.91.0"), PLACE)
+    pip_install(operator, make_wheel(operator.shared, "0.91.0"), PLACE)
     assert "next: systemctl restart shmmapd" in typed(operator, *restart)
     assert '"version": "0.91.0"' in typed(operator, "shmmap status --json").replace('":"', '": "')
 

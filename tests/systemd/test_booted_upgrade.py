@@ -7,16 +7,14 @@ import json
 import shutil
 import subprocess
 import sys
-import sysconfig
-import zipfile
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
 import shmmap
 from shmmap.testing.daemon_process import wait_readable
 from shmmap.version import build_version
+from tests.support.booted_service import make_environment, make_wheel, pip_install
 from tests.support.booted_systemd import BootedSystemd
 from tests.support.daemon_process import ROOT
 from tests.systemd.conftest import MAP
@@ -67,50 +65,11 @@ else:
 """
 
 
-def wheel(directory: Path, version: str) -> Path:
-    """Make a wheel of this tree under another number; a build would need a network."""
-    built, about = directory / f"shmmap-{version}-py3-none-any.whl", f"shmmap-{version}.dist-info"
-    folders = {"shmmap": "shmmap", "clients/shmmap_clients": "shmmap_clients", "systemd": "shmmap/_systemd"}
-    texts = {
-        f"{about}/METADATA": f"Metadata-Version: 2.1\nName: shmmap\nVersion: {version}\n",
-        f"{about}/WHEEL": "Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: py3-none-any\n",
-        f"{about}/entry_points.txt": "[console_scripts]\nshmmap = shmmap.cli:main\n"
-        "shmmapd = shmmap.cli:serve_main\n",
-    }
-    for folder, inside in folders.items():
-        for path in (ROOT / folder).rglob("*"):
-            if path.is_file() and "__pycache__" not in path.parts:
-                texts[f"{inside}/{path.relative_to(ROOT / folder)}"] = path.read_text(encoding="utf-8")
-    file = "shmmap/version.py"
-    texts[file] = texts[file].replace(f'"{shmmap.__version__}"', f'"{version}"')
-    texts[f"{about}/RECORD"] = "".join(f"{name},,\n" for name in [*texts, f"{about}/RECORD"])
-    with zipfile.ZipFile(built, "w") as archive:
-        for name, text in texts.items():
-            archive.writestr(name, text)
-    return built
-
-
-def pip_install(machine: BootedSystemd, built: Path, place: str) -> None:
-    """``pip install`` a wheel into the environment of the service."""
-    pip = f"{sys.executable} -m pip --python {place}/bin/python install -q --no-deps --no-index"
-    machine.shell(f"unset PYTHONPATH; {pip} /exchange/{built.name} 2>&1")
-
-
-def made_environment(machine: BootedSystemd, place: str) -> None:
-    """Make an environment for the service, with the packages of this one."""
-    packages = sysconfig.get_path("purelib")
-    machine.shell(f"""
-        unset PYTHONPATH
-        {sys.executable} -m venv --without-pip {place}
-        echo {packages} >"$({place}/bin/python -c 'import site; print(site.getsitepackages()[0])')/others.pth"
-    """)
-
-
 @pytest.fixture
 def installed(fresh: BootedSystemd) -> Iterator[BootedSystemd]:
     """A service of an environment of its own."""
-    wheels = [wheel(fresh.shared, version) for version in ("0.90.0", "0.91.0")]
-    made_environment(fresh, PLACE)
+    wheels = [make_wheel(fresh.shared, version) for version in ("0.90.0", "0.91.0")]
+    make_environment(fresh, PLACE)
     pip_install(fresh, wheels[0], PLACE)
     fresh.shell(f"""
         unset PYTHONPATH
