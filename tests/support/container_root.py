@@ -128,7 +128,7 @@ class ContainerRoot:
                 assert source == "."
                 self._copy(context, files, target)
             else:
-                done = self.run(["sh", "-c", rest], user="root", environment=_for_pip())
+                done = self.run(["sh", "-c", rest], user="root", environment=pip_variables())
                 assert done.returncode == 0, f"RUN {rest}\n{done.stderr}"
 
     def _copy(self, context: Path, files: Sequence[str], target: str) -> None:
@@ -230,7 +230,8 @@ class ContainerRoot:
         self._holder.communicate()
 
 
-def _for_pip() -> dict[str, str]:
+def pip_variables() -> dict[str, str]:
+    """Return the variables of the environment that pip, and what it asks, read."""
     kept = {name: value for name, value in os.environ.items() if name.startswith("PIP_")}
     names = ("http_proxy", "https_proxy", "HTTP_PROXY", "HTTPS_PROXY", "no_proxy", "SSL_CERT_FILE", "LANG")
     return kept | {name: os.environ[name] for name in names if name in os.environ}

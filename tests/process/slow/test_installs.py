@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.process.distributions import tree
-from tests.support.container_root import ContainerRoot, Image
+from tests.support.container_root import ContainerRoot, Image, pip_variables
 from tests.support.daemon_process import ROOT
 from tests.support.namespaces import namespaces_or_skip
 from tests.support.pages import Reader, read_page, write_program
@@ -19,27 +20,31 @@ from tests.support.skips import index_or_skip
 
 @pytest.fixture
 def clone(tmp_path: Path) -> Path:
-    """A clone of this tree, as it stands on disk."""
+    """A clone of this tree, as it stands on disk; of its packages it asks for those of the command line."""
     folder = tmp_path / "shmmap"
     listed = "\0".join(tree())
     command = f"tar -C '{ROOT}' --null -T - -cf - | tar -C '{folder}' -xf - && cd '{folder}' && git init -q"
     folder.mkdir()
     subprocess.run(["sh", "-c", command], input=listed, text=True, check=True)
+    project = folder / "pyproject.toml"
+    text = project.read_text(encoding="utf-8")
+    fewer, count = re.subn(
+        r"^dependencies = \[\n.*?^\]",
+        'dependencies = ["msgspec", "numpy", "tomli"]',
+        text,
+        flags=re.MULTILINE | re.DOTALL,
+    )
+    assert count == 1
+    project.write_text(fewer, encoding="utf-8")
     identity = ["-c", "user.name=test", "-c", "user.email=test@localhost"]
     for words in (["add", "-A"], [*identity, "commit", "-q", "-m", "all"]):
         subprocess.run(["git", *words], cwd=folder, check=True)
     return folder
 
 
-def without_dependencies(text: str) -> dict[str, str]:
-    """Return variables for lines that install everything: here what they depend on is left out."""
-    assert "install" in text
-    return {"PIP_NO_DEPS": "1", "PIP_DISABLE_PIP_VERSION_CHECK": "1"}
-
-
 @pytest.fixture
 def reader(tmp_path: Path) -> Iterator[Reader]:
-    one = Reader(tmp_path, [], without_dependencies("install"))
+    one = Reader(tmp_path, [], {"PIP_CACHE_DIR": str(Path.home() / ".cache" / "pip")})
     yield one
     one.leave()
 
@@ -61,7 +66,7 @@ def test_versions_side_by_side(reader: Reader, clone: Path, tmp_path: Path) -> N
 
 @pytest.mark.root
 def test_an_image_of_a_vehicle_s_disk(clone: Path, tmp_path: Path) -> None:
-    """This machine stands for the image; of the packages it gets what the last line needs."""
+    """This machine stands for the image."""
     namespaces_or_skip("--mount", "--pid")
     (tmp_path / "container").mkdir()
     try:
@@ -72,11 +77,8 @@ def test_an_image_of_a_vehicle_s_disk(clone: Path, tmp_path: Path) -> None:
     (clone / "image").mkdir()
 
     def typed(line: str) -> str:
-        environment = {
-            "PATH": f"{tmp_path}:/usr/bin:/bin:/usr/sbin:/sbin",
-            "HOME": str(tmp_path),
-            **without_dependencies("install"),
-        }
+        path = f"{tmp_path}:/usr/bin:/bin:/usr/sbin:/sbin"
+        environment = {"PATH": path, "HOME": str(tmp_path), **pip_variables()}
         words = root.on_host(f"cd '{clone}'; {line}", environment)
         done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=400)
         assert done.returncode == 0, f"{line}\n{done.stdout}{done.stderr}"
@@ -88,7 +90,6 @@ def test_an_image_of_a_vehicle_s_disk(clone: Path, tmp_path: Path) -> None:
         typed(copy)
         with index_or_skip():
             typed(install)
-        typed("chroot image /opt/shmmap/bin/pip install -q msgspec tomli")
         typed(units)
         unit = typed("cat image/etc/systemd/system/shmmapd.service")
         assert "\nExecStart=/opt/shmmap/bin/shmmapd " in unit

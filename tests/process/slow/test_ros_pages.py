@@ -68,7 +68,11 @@ def user(domain: RosDomain, served: DaemonProcess, tmp_path: Path) -> Iterator[T
     mine = {name: text for name, text in domain.environment.items() if name.startswith(("ROS_", "RMW_"))}
     (tmp_path / "bin").mkdir()
     write_program(tmp_path / "bin" / "python3", f'exec "{sys.executable}" "$@"')  # as ROS's
-    reader = Reader(tmp_path, [tmp_path / "bin"], {**mine, "SHMMAP_ENDPOINT": served.endpoint})
+    reader = Reader(
+        tmp_path,
+        [tmp_path / "bin"],
+        {**mine, "SHMMAP_ENDPOINT": served.endpoint, "SHMMAP_SHM_DIR": served.shm_dir},
+    )
     yield reader.terminal(tmp_path / "shmmap")
     reader.leave()
 
