@@ -136,6 +136,8 @@ def test_a_daemon_on_the_host_has_clients_in_containers(
     """)
     assert done.returncode == 0, done.stderr
     *prepared, serve = (line for line in PAGE.commands(block) if not line.startswith("docker "))
+    if (segments := re.search(r" --shm-dir (\S+)", serve)) is not None:
+        environment["SHMMAP_SHM_DIR"] = segments[1]  # health has no other way to know it
     log = tmp_path / "log"
     try:
         for line in prepared:
