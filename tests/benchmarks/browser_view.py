@@ -5,6 +5,9 @@
 
 MAP is best one of `tests.benchmarks.tile_map`, its layers ``voxel`` of all leaves prepared into DIR
 (`shmmap prepare`).  No browser runs: `tests.support.viewer` takes what one would.
+
+The drive is made twice, alone and with a viewer that follows it.  A cell of the driver's window is *stale*
+when the page does not show it although it has been in the window for a second.
 """
 
 from __future__ import annotations
@@ -15,18 +18,23 @@ import signal
 import statistics
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 import shmmap
+from shmmap.geometry import distance_to_boxes
 from tests.support.daemon_process import ROOT, DaemonProcess
 from tests.support.viewer import Viewer
 
 SPEED = 10.0  # m/s
+RADIUS_M = 60.0
+LATE_S = 1.0
 
 
 @contextmanager
@@ -46,20 +54,85 @@ def viewing(one: DaemonProcess, *words: str) -> Iterator[str]:
         process.wait(10)
 
 
-def drive(one: DaemonProcess, seconds: float, row: int) -> dict[str, int]:
-    """Drive along a street of the map, points and an ``ndt`` layer in the window; returns counters."""
+class Follower:
+    """A page that follows the driver, in a thread; counts the cells that it should have and lacks.
+
+    Attributes
+    ----------
+    boxes
+        (N, 4): the map's cells, metres.
+    pose
+        Where the driver is, x and y; None before the drive.
+    looks, cells, stale
+        How often the page was looked at, and the sums of cells that it should have shown and did not show.
+    """
+
+    def __init__(self, url: str, boxes: NDArray[np.float64]) -> None:
+        self.boxes = boxes
+        self.pose: tuple[float, float] | None = None
+        self.looks = self.cells = self.stale = 0
+        self.page = Viewer(url)
+        self.page.look((0.0, 0.0, 30.0), (5.0, 5.0, 25.0))
+        self._since: dict[int, float] = {}
+        self._ends = threading.Event()
+        self._taker = threading.Thread(target=self._take)
+
+    def __enter__(self) -> Follower:
+        self.page.quiet(2.0)
+        self._taker.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._ends.set()
+        self._taker.join()
+        self.page.close()
+
+    def _take(self) -> None:
+        while not self._ends.is_set():
+            self.page.receive(0.1)
+            if self.pose is not None:
+                self._judge(*self.pose, time.monotonic())
+
+    def _judge(self, x: float, y: float, now_s: float) -> None:
+        near = np.flatnonzero(distance_to_boxes(x, y, self.boxes) <= RADIUS_M).tolist()
+        self._since = {cell: self._since.get(cell, now_s) for cell in near}
+        shown = {int(name.split("/")[3].partition(".")[0]) for name in self.page.clouds}
+        due = {cell for cell, since_s in self._since.items() if now_s - since_s >= LATE_S}
+        self.looks += 1
+        self.cells += len(due)
+        self.stale += len(due - shown)
+
+
+def drive(one: DaemonProcess, seconds: float, row: int, *, seen: bool) -> None:
+    """Drive along a street of the map, followed by a viewer or alone, and print what the driver lacked."""
     with shmmap.connect(one.endpoint, shm_dir=one.shm_dir, name="driver") as client:
-        before = client.stats().counters
         min_x, min_y, _, _ = client.bounds or (0.0, 0.0, 0.0, 0.0)
         y = min_y + 90.0 + 220.0 * row
-        with shmmap.MapWindow(client, radius=60.0) as window:
-            window.move_to(min_x + 60.0, y, wait=60.0)
-            began = time.monotonic()
-            while (now := time.monotonic() - began) < seconds:
-                window.move_to(min_x + 60.0 + SPEED * now, y, vx=SPEED, heading=0.0)
-                time.sleep(0.05)
-        after = client.stats().counters
-    return {name: after[name] - before[name] for name in ("hits", "misses", "prefetch_misses", "evictions")}
+        with shmmap.MapWindow(client, radius=RADIUS_M) as window:
+            window.move_to(min_x + RADIUS_M, y, wait=60.0)
+            boxes = client.metadata().boxes
+            with (
+                viewing(one, "--follow", "driver") if seen else nullcontext("") as url,
+                Follower(url, boxes) if seen else nullcontext() as follower,
+            ):
+                moves = lacking = 0
+                before = client.stats().counters
+                began = time.monotonic()
+                while (now := time.monotonic() - began) < seconds:
+                    x = min_x + RADIUS_M + SPEED * now
+                    window.move_to(x, y, vx=SPEED, heading=0.0)
+                    moves, lacking = moves + 1, lacking + (not window.complete)
+                    if follower is not None:
+                        follower.pose = x, y
+                    time.sleep(0.05)
+                after = client.stats().counters
+    names = ("prefetch_misses", "misses", "hits", "evictions")
+    counted = ", ".join(f"{name} {after[name] - before[name]:,}" for name in names)
+    print(f"{'with a viewer' if seen else 'alone'}: {moves} moves, {lacking} without all cells; {counted}")
+    if follower is not None:
+        page = follower.page
+        print(f"  on the page {follower.stale} of {follower.cells:,} cells stale, in {follower.looks} looks;")
+        print(f"  it has {page.points:,} points, and was sent {page.nbytes / 1e6:.1f} MB")
 
 
 def main() -> None:
@@ -107,30 +180,10 @@ def main() -> None:
         print(f"first cell: median {statistics.median(firsts):.2f} s, most {max(firsts):.2f} s")
         print(f"a place: median {statistics.median(amounts):.1f} MB, most {max(amounts):.1f} MB")
         print(f"a move of 5 m: median {statistics.median(moves):.2f} MB, most {max(moves):.2f} MB")
-    for beside in (False, True):
+    for seen in (False, True):
         one = DaemonProcess(arguments.map, "--cache-dir", arguments.cache_dir, forked=False)
         with one:
-            if not beside:
-                print("alone:", drive(one, arguments.drive, 2))
-                continue
-            with viewing(one) as url, Viewer(url) as page:
-                import threading
-
-                page.look((0.0, 0.0, 200.0))
-                ends = threading.Event()
-
-                def take(page: Viewer = page, ends: threading.Event = ends) -> None:
-                    while not ends.is_set():
-                        page.receive(0.1)
-
-                taker = threading.Thread(target=take)
-                taker.start()
-                try:
-                    print("with a viewer:", drive(one, arguments.drive, 2))
-                finally:
-                    ends.set()
-                    taker.join()
-                print(f"  it got {page.points:,} points, {page.nbytes / 1e6:.1f} MB")
+            drive(one, arguments.drive, 2, seen=seen)
 
 
 if __name__ == "__main__":

@@ -174,25 +174,6 @@ def check(source: str, folder: Path) -> None:
     subprocess.run(["g++", *options, str(path)], check=True)
 
 
-def test_every_block_is_tested() -> None:
-    assert set(PAGE.blocks) == {
-        "serve",
-        "venv",
-        "launch-component",
-        "launch-core",
-        "member",
-        "update",
-        "patch",
-        "options",
-        "proposal",
-        "proposal-ndt",
-        "proposal-update",
-        "ndt-leaves",
-        "pcl-cloud",
-    }
-    assert len(re.findall(r"^```\w+$", PAGE.text, re.MULTILINE)) == len(PAGE.blocks)
-
-
 def test_the_launch_files_name_the_node() -> None:
     """autoware_core's line loses its package; universe's component becomes ours, or a node as core's."""
     environment = PAGE.commands("venv")[0].split()[-1]
@@ -206,6 +187,8 @@ def test_the_launch_files_name_the_node() -> None:
     )
     ours = {"pkg": "shmmap_ros", "plugin": "shmmap_ros::MapLoader"}
     assert here == {**was, **ours} == {**ours, "name": "pointcloud_map_loader"}
+    (shown,) = read_page("clients/ros/README.md").blocks["component"]
+    assert here == ElementTree.fromstring(f"{shown}</composable_node>").attrib
     source = (ROOT / "clients" / "ros" / "src" / "map_loader.cpp").read_text()
     assert f"RCLCPP_COMPONENTS_REGISTER_NODE({here['plugin']})" in source
 

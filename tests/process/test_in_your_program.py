@@ -55,9 +55,7 @@ def run(program: list[str], one: DaemonProcess, folder: Path) -> str:
     return done.stdout
 
 
-def test_every_block_is_tested() -> None:
-    assert set(PAGE.blocks) == {*PRINTED, *QUOTED, "open3d"}
-    assert PAGE.fences == len(PAGE.blocks)
+def test_the_page_is_short() -> None:
     assert len(PAGE.text.split()) < 1000
 
 

@@ -11,6 +11,7 @@ import re
 import shlex
 import shutil
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,56 +19,31 @@ import numpy as np
 import pytest
 import yaml
 
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
 import shmmap
 from shmmap.daemon.config import load_config
 from tests.process.conftest import DaemonFactory
 from tests.support.cloud_bytes import write_las
 from tests.support.command_line import Shmmap, publish
 from tests.support.daemon_process import ROOT, Deadline
-from tests.support.divided_map import DividedMap, make_map
+from tests.support.divided_map import DividedMap, make_map, random_points, write_pcd
 from tests.support.map_stores import KEYS, BucketServer
 from tests.support.pages import Terminal, read_page, reader_with_programs
 from tests.support.web_servers import faulty_web, free_port
 
 README = read_page("README.md")
 START = read_page(".github/site/START.md")
+BRIDGE = read_page("clients/shmmap_clients/ros_bridge/ROS_BRIDGE.md")
 CLIENTS = read_page("clients/README.md")
+LAYERS = read_page("shmmap/layers/LAYERS.md")
 LIVE_MAPS = read_page("shmmap/client/live/LIVE_MAPS.md")
 PUBLISHING = read_page("shmmap/publishing/PUBLISHING.md")
 SERVING = read_page("shmmap/publishing/SERVING_FROM_A_BUCKET.md")
 SLICES = read_page("shmmap/publishing/SLICES.md")
-
-TESTED = {  # the named blocks of a page, and how many more blocks of commands or programs it has
-    "README.md": ("clone server points cpp cpp-run ros", 2),  # the lines that make an environment
-    ".github/site/START.md": ("picture serve look window", 0),
-    "clients/README.md": (
-        "first-scan-map first-scan ndt pose-init compare elevation elevation-whole",
-        6,  # of commands
-    ),
-    "shmmap/client/live/LIVE_MAPS.md": ("serve map read", 0),
-    "shmmap/dividing/OWN_CLOUD.md": ("install serve query view browser", 0),
-    "shmmap/origin/AUTOWARE_MAP.md": ("serve query python", 0),
-    "shmmap/publishing/GATEWAY.md": ("start serve", 0),
-    "shmmap/publishing/PUBLISHING.md": (
-        "install credentials publish directory fetch install-sign sign rotate versions",
-        0,
-    ),
-    "shmmap/publishing/SERVING_FROM_A_BUCKET.md": (
-        "install credentials serve ask settings down trust health status doctor log",
-        -5,  # settings, output
-    ),
-    "shmmap/publishing/SLICES.md": (
-        "install credentials by-hand parallel slurm dask",
-        -1,  # a script
-    ),
-}
-
-
-@pytest.mark.parametrize("name", TESTED)
-def test_every_block_is_tested(name: str) -> None:
-    page, (blocks, more) = read_page(name), TESTED[name]
-    assert sorted(page.blocks) == sorted(blocks.split())
-    assert page.fences == len(page.blocks) + more
 
 
 @pytest.mark.parametrize(
@@ -77,13 +53,17 @@ def test_every_block_is_tested(name: str) -> None:
         ("remote", SERVING.commands("install")[0]),
         ("remote", SLICES.commands("install")[0]),
         ("sign", PUBLISHING.commands("install-sign")[0]),
+        ("las", read_page("shmmap/dividing/OWN_CLOUD.md").commands("install")[0]),
+        ("opencl", CLIENTS.commands("device")[0].partition("#")[0].replace("install", "install -q")),
+        ("ros", BRIDGE.commands("install")[0].replace("install", "install -q")),
         ("sign", "pip install -q" + re.findall(r"`pip install( tuf [^`]+)`", SERVING.text)[0]),
     ],
 )
 def test_packages_are_those_of_the_extra(extra: str, install: str) -> None:
     project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     (packages,) = re.findall(rf"^{extra} = \[\n(.*?)^\]", project, re.MULTILINE | re.DOTALL)
-    assert shlex.split(install)[3:] == re.findall(r'"([a-z\[\]]+)>=', packages)
+    named = [word.partition(">=")[0] for word in shlex.split(install)[3:]]
+    assert named == re.findall(r'"([a-z\[\]]+)>=', packages)
 
 
 def exported(commands: list[str]) -> dict[str, str]:
@@ -120,10 +100,11 @@ def test_the_readme_is_short() -> None:
 
 
 def test_two_lines_do_everything() -> None:
-    demo, tests = (line for line in README.text.splitlines() if line.startswith("python3 -m venv "))
-    assert tests.endswith(" && pytest -q")
+    (demo,), (tests,) = README.commands("demo"), README.commands("tests")
     (everything,) = read_page("shmmap/INSTALL.md").commands("everything")
+    (for_tests,) = read_page("tests/benchmarks/BENCHMARKS.md").commands("install")
     assert demo == f"{everything} && shmmap demo"
+    assert tests == f"{for_tests} && pytest -q"
 
 
 def test_three_lines_for_ros() -> None:
@@ -160,6 +141,13 @@ def test_commands_of_a_user(newcomer: Terminal) -> None:
     status, query = re.findall(r"`(shmmap (?:status|query)[^`]*)`", README.text)
     assert "healthy" in newcomer.run(status)
     assert "town_160_160.pcd" in newcomer.run(query)
+
+
+def test_what_is_in_memory(newcomer: Terminal) -> None:
+    status, ls, clients = map(newcomer.run, read_page("shmmap/daemon/MEMORY.md").commands("look"))
+    assert "healthy" in status
+    assert "town_" in ls
+    assert clients
 
 
 def test_programs_of_the_readme(newcomer: Terminal) -> None:
@@ -224,12 +212,43 @@ def test_from_cpp(newcomer: Terminal, tmp_path: Path) -> None:
 
 
 def test_a_layer(newcomer: Terminal) -> None:
-    printed = newcomer.python(read_page("shmmap/layers/LAYERS.md").blocks["layers"]).splitlines()
+    printed = newcomer.python(LAYERS.blocks["layers"]).splitlines()
     assert len(printed) >= 4
     for line in printed:
         found = re.fullmatch(r"\((\d+), 3\) \((\d+), 6\) Lattice\(leaf=\(2.0, 2.0, 2.0\), .*\)", line)
         assert found is not None, line
         assert found[1] == found[2]
+
+
+def test_a_kind_of_layer_of_one_s_own_without_a_daemon(user: Terminal, tmp_path: Path) -> None:
+    """The page's entry point, of a package that is installed; a layer of a file."""
+    entry_points = tomllib.loads("\n".join(LAYERS.blocks["entry-point"]))["project"]["entry-points"]
+    ((group, kinds),) = entry_points.items()
+    ((name, value),) = kinds.items()
+    module = tmp_path / "packages" / f"{value.partition(':')[0].replace('.', '/')}.py"
+    module.parent.mkdir(parents=True)
+    shutil.copy(ROOT / "clients/examples/roughness_layer.py", module)
+    information = tmp_path / "packages" / "my_package-1.0.dist-info"
+    information.mkdir()
+    (information / "METADATA").write_text("Metadata-Version: 2.1\nName: my_package\nVersion: 1.0\n")
+    (information / "entry_points.txt").write_text(f"[{group}]\n{name} = {value}\n")
+    points = random_points(np.random.default_rng(1), (0, 0), 500)
+    write_pcd(tmp_path / "cloud.pcd", points)
+    user.run(f"export PYTHONPATH='{tmp_path}/packages':$PYTHONPATH")
+    (program,) = LAYERS.commands("program")
+    user.run(program.replace("ndt(leaf=2.0)", "roughness(edge=4.0)"))
+    with np.load(tmp_path / "ndt.npz") as found:
+        assert "roughness" in found
+        assert 0 < len(found["roughness"]) <= 25
+
+
+@pytest.mark.usefixtures("layer_kernels")
+def test_a_layer_of_a_file(user: Terminal, tmp_path: Path) -> None:
+    points = random_points(np.random.default_rng(1), (0, 0), 500)
+    write_pcd(tmp_path / "cloud.pcd", points)
+    user.run(LAYERS.commands("program")[0])
+    with np.load(tmp_path / "ndt.npz") as found:
+        assert 0 < found["count"].sum() <= 500
 
 
 # --- clients/README.md --------------------------------------------------------------------------------
@@ -252,11 +271,30 @@ def test_an_example_of_the_clients(
     assert len([line for line in program if line.strip()]) <= 12
     one = daemon(divided_map.root)
     user.run(f"export SHMMAP_ENDPOINT='{one.endpoint}' SHMMAP_SHM_DIR='{one.shm_dir}'")
-    user.run(f"export PYTHONPATH='{ROOT}:{ROOT}/clients'")
     assert re.search(printed, user.python(program))
 
 
 # --- LIVE_MAPS.md -------------------------------------------------------------------------------------
+
+
+def test_what_a_live_map_costs_is_said_by_resolution_and_range(tmp_path: Path) -> None:
+    """The settings are settings, with a resolution of the table; the command measures one of its places."""
+    file = tmp_path / "shmmap.toml"
+    file.write_text("\n".join(LIVE_MAPS.blocks["settings"]))
+    (settings,) = load_config({}, file=str(file), environ={}).live
+    lines = [line for line in LIVE_MAPS.text.splitlines() if re.match(r"\| (voxels|[\d.]+ m) \|", line)]
+    head, *rows = ([word.strip() for word in line.strip("|").split("|")] for line in lines)
+    ranges = [word.removeprefix("rays of ").removesuffix(" m") for word in head[1:]]
+    costs = {
+        f"{row[0].removesuffix(' m')}/{metres}": cost
+        for row in rows
+        for metres, cost in zip(ranges, row[1:], strict=True)
+        if cost
+    }
+    assert all(re.fullmatch(r"\d+ ms, \d+ MB", cost) for cost in costs.values())
+    assert f"{settings.resolution:g}/30" in costs
+    (measured,) = re.findall(r"tests\.benchmarks\.live_insertion --alone --setting (\S+)`", LIVE_MAPS.text)
+    assert measured in costs
 
 
 def test_a_wall_is_mapped_and_read(tmp_path: Path) -> None:
@@ -375,6 +413,7 @@ def test_the_link_is_down(daemon: DaemonFactory, tmp_path: Path) -> None:
             assert {failure.code for failure in cells.failed} == {"offline"}
             assert {cell.id for cell in cells} == {cell.id for cell in near}
             *looks, tail = (shlex.split(line)[1:] for line in SERVING.commands("down"))
+            assert [words[0] for words in looks] == ["health", "status", "doctor"]
             for words in looks:
                 text = verbs(*words, code=1 if words[0] == "health" else 0)
                 for line in SERVING.blocks[words[0]]:

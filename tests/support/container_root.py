@@ -8,6 +8,7 @@ one is an error, so that nothing is silently left out.
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import re
@@ -42,15 +43,16 @@ read -r _
 
 ENTER = r"""
 set -eu
-R=$1; owner=$2; volumes=$3; shift 3
+R=$1; owner=$2; groups=$3; ipc=$4; volumes=$5; shift 5
 mount -t proc proc "$R/proc"
-mount -t tmpfs -o mode=1777,size=64m tmpfs "$R/dev/shm"
+if [ "$ipc" = host ]; then mount --bind /dev/shm "$R/dev/shm"
+else mount -t tmpfs -o mode=1777,size=64m tmpfs "$R/dev/shm"; fi
 echo "$volumes" | while read -r from to how; do
     [ -n "$from" ] || continue
-    mkdir -p "$R$to"; mount --bind "$from" "$R$to"
+    mkdir -p "$R$to"; mount --rbind "$from" "$R$to"
     [ "$how" != ro ] || mount -o remount,bind,ro "$R$to"
 done
-exec chroot --userspec="$owner" "$R" env -i "$@"
+exec chroot --userspec="$owner" ${groups:+--groups="$groups"} "$R" env -i "$@"
 """
 
 
@@ -126,7 +128,7 @@ class ContainerRoot:
                 assert source == "."
                 self._copy(context, files, target)
             else:
-                done = self.run(["sh", "-c", rest], user="root", environment=_for_pip())
+                done = self.run(["sh", "-c", rest], user="root", environment=pip_variables())
                 assert done.returncode == 0, f"RUN {rest}\n{done.stderr}"
 
     def _copy(self, context: Path, files: Sequence[str], target: str) -> None:
@@ -151,13 +153,15 @@ class ContainerRoot:
         user: str,
         environment: Mapping[str, str],
         volumes: Sequence[tuple[str, str, str]],
+        groups: Sequence[str] = (),
+        ipc: str = "private",
     ) -> list[str]:
         listed = "\n".join(" ".join(one) for one in volumes)
         given = {"PATH": self._path, "HOME": "/tmp", **environment}
         return [
             *self._inside(),
             *("unshare", "--mount", "--pid", "--ipc", "--fork", "--kill-child", "--propagation", "private"),
-            *("sh", "-c", ENTER, "sh", str(self.root), self._owner(user), listed),
+            *("sh", "-c", ENTER, "sh", str(self.root), self._owner(user), ",".join(groups), ipc, listed),
             *(f"{name}={value}" for name, value in given.items()),
             *command,
         ]
@@ -165,6 +169,8 @@ class ContainerRoot:
     def _owner(self, user: str) -> str:
         if user == "root":
             return "0:0"
+        if user.isdecimal():
+            return f"{user}:0"
         done = subprocess.run(
             [*self._inside(), "chroot", self.root, "getent", "passwd", user],
             check=True,
@@ -185,6 +191,31 @@ class ContainerRoot:
         words = self._words(command, user or self.image.user, environment or self.image.environment, volumes)
         return subprocess.run(words, capture_output=True, text=True, check=False, timeout=STEP_S)
 
+    def on_host(self, script: str, environment: Mapping[str, str] | None = None) -> list[str]:
+        """Return the command that runs lines as root outside of containers, with the mounts of the image."""
+        given = [f"{name}={value}" for name, value in (environment or {}).items()]
+        path = f"PATH={(environment or {}).get('PATH', self._path)}"
+        return [*self._inside(), "env", "-i", path, *given, "bash", "-euc", script]
+
+    def docker_run(self, line: str, *command: str) -> subprocess.CompletedProcess[str]:
+        """Run a command in a container as ``docker run ... IMAGE`` says; other options are an error."""
+        script = f"docker() {{ printf '%s\\n' \"$@\"; }}; {line}"
+        verb, *words = subprocess.run(
+            self.on_host(script), check=True, capture_output=True, text=True
+        ).stdout.splitlines()
+        assert (verb, words.pop()) == ("run", "IMAGE"), line
+        parser = argparse.ArgumentParser(exit_on_error=False)
+        parser.add_argument("-v", action="append", default=[])
+        parser.add_argument("-e", action="append", default=[])
+        parser.add_argument("--user", default="root")
+        parser.add_argument("--group-add", action="append", default=[])
+        parser.add_argument("--ipc", default="private")
+        given = parser.parse_args(words)
+        volumes = [(*one.split(":"), "rw")[:3] for one in given.v]
+        environment = {"PATH": self.image.environment["PATH"], **dict(one.split("=", 1) for one in given.e)}
+        words = self._words(command, given.user, environment, volumes, given.group_add, given.ipc)
+        return subprocess.run(words, capture_output=True, text=True, check=False, timeout=STEP_S)
+
     def start(
         self, command: Sequence[str], volumes: Sequence[tuple[str, str, str]], log: Path
     ) -> subprocess.Popen[bytes]:
@@ -199,7 +230,8 @@ class ContainerRoot:
         self._holder.communicate()
 
 
-def _for_pip() -> dict[str, str]:
+def pip_variables() -> dict[str, str]:
+    """Return the variables of the environment that pip, and what it asks, read."""
     kept = {name: value for name, value in os.environ.items() if name.startswith("PIP_")}
     names = ("http_proxy", "https_proxy", "HTTP_PROXY", "HTTPS_PROXY", "no_proxy", "SSL_CERT_FILE", "LANG")
     return kept | {name: os.environ[name] for name in names if name in os.environ}

@@ -46,8 +46,8 @@ class Page:
 
     @property
     def fences(self) -> int:
-        """How many blocks of commands or programs there are, with a name or without."""
-        return len(re.findall(r"^```(?:sh|python|cpp)$", self.text, re.MULTILINE))
+        """How many blocks of code there are, with a name or without; what has no language is a drawing."""
+        return len(re.findall(r"^ *```\w+$", self.text, re.MULTILINE))
 
     @property
     def links(self) -> list[str]:
@@ -146,38 +146,45 @@ class Terminal:
             server.wait()
 
     @contextlib.contextmanager
+    def running(self, command: str, **variables: str) -> Iterator[subprocess.Popen[bytes]]:
+        """Run a program without end until the end of the block, when Ctrl-C has to end it well."""
+        script = self._script(command).replace(command, f"exec {command}")
+        log = self._state.with_suffix(".log")
+        with log.open("w") as output:
+            program = subprocess.Popen(
+                ["bash", "-c", script],
+                cwd=self._cwd,
+                env=self._environment | {"PYTHONFAULTHANDLER": "1", **variables},
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+            )
+        try:
+            yield program
+        finally:
+            program.send_signal(signal.SIGINT)
+            ended = wait_ended(program.pid)
+            state = "" if ended else Path(f"/proc/{program.pid}/status").read_text(encoding="utf-8")
+            if not ended:
+                program.send_signal(signal.SIGABRT)  # its log then has each thread's stack
+                program.send_signal(signal.SIGCONT)
+            code = program.wait()
+        assert ended, f"{command}: Ctrl-C did not end it\n{state}\n{log.read_text()}"
+        assert code == 0, f"{command}: {code}\n{log.read_text()}"
+
+    @contextlib.contextmanager
     def serving(self, command: str) -> Iterator[None]:
         """Run a daemon from its readiness until it is stopped with Ctrl-C."""
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ready:
             address = f"\0{self._state}"  # abstract: no path is too long, nothing is left
             ready.bind(address)
-            script = self._script(command).replace(command, f"exec {command}")
-            log = self._state.with_suffix(".log")
-            with log.open("w") as output:
-                daemon = subprocess.Popen(
-                    ["bash", "-c", script],
-                    cwd=self._cwd,
-                    env=self._environment | {"NOTIFY_SOCKET": "@" + address[1:], "PYTHONFAULTHANDLER": "1"},
-                    stdin=subprocess.DEVNULL,
-                    stdout=output,
-                    stderr=output,
-                )
-            try:
+            with self.running(command, NOTIFY_SOCKET="@" + address[1:]) as daemon:
                 fd = os.pidfd_open(daemon.pid)
                 came = wait_readable([ready.fileno(), fd], _SERVE_S)
                 os.close(fd)
+                log = self._state.with_suffix(".log")
                 assert came == [ready.fileno()], f"{command}: the daemon did not get ready\n{log.read_text()}"
                 yield
-            finally:
-                daemon.send_signal(signal.SIGINT)
-                ended = wait_ended(daemon.pid)
-                state = "" if ended else Path(f"/proc/{daemon.pid}/status").read_text(encoding="utf-8")
-                if not ended:
-                    daemon.send_signal(signal.SIGABRT)  # its log then has each thread's stack
-                    daemon.send_signal(signal.SIGCONT)
-                code = daemon.wait()
-            assert ended, f"{command}: Ctrl-C did not end it\n{state}\n{log.read_text()}"
-            assert code == 0, f"{command}: {code}\n{log.read_text()}"
 
 
 class Reader:
@@ -234,14 +241,25 @@ def write_program(path: Path, text: str) -> None:
     path.chmod(0o755)
 
 
+_PROGRAMS = {
+    "shmmap": "-m shmmap.cli",
+    "shmmap-compare": "-m shmmap_clients.compare_map_filter",
+    "shmmap-ndt": "-m shmmap_clients.ndt_scan_matcher",
+    "shmmap-pose-init": "-m shmmap_clients.pose_initializer",
+    "shmmap-rolling": "-m shmmap_clients.rolling_map",
+    "python": "",
+    "python3": "",
+}
+
+
 @contextlib.contextmanager
 def reader_with_programs(home: Path, **variables: str) -> Iterator[Reader]:
-    """Have a reader whose ``shmmap``, ``python`` and ``python3`` are this tree's and this interpreter's."""
+    """Have a reader whose programs are this tree's and this interpreter's."""
     programs = home / "bin"
     programs.mkdir()
-    for name, words in (("shmmap", "-m shmmap.cli"), ("python", ""), ("python3", "")):
+    for name, words in _PROGRAMS.items():
         write_program(programs / name, f'exec "{sys.executable}" {words} "$@"')
-    reader = Reader(home, [programs], {"PYTHONPATH": str(ROOT), **variables})
+    reader = Reader(home, [programs], {"PYTHONPATH": f"{ROOT}:{ROOT / 'clients'}", **variables})
     try:
         yield reader
     finally:

@@ -7,16 +7,14 @@ import json
 import shutil
 import subprocess
 import sys
-import sysconfig
-import zipfile
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
 import shmmap
 from shmmap.testing.daemon_process import wait_readable
 from shmmap.version import build_version
+from tests.support.booted_service import make_environment, make_wheel, pip_install
 from tests.support.booted_systemd import BootedSystemd
 from tests.support.daemon_process import ROOT
 from tests.systemd.conftest import MAP
@@ -67,49 +65,15 @@ else:
 """
 
 
-def wheel(directory: Path, version: str) -> Path:
-    """Make a wheel of this tree under another number; a build would need a network."""
-    built, about = directory / f"shmmap-{version}-py3-none-any.whl", f"shmmap-{version}.dist-info"
-    folders = {"shmmap": "shmmap", "clients/shmmap_clients": "shmmap_clients", "systemd": "shmmap/_systemd"}
-    texts = {
-        f"{about}/METADATA": f"Metadata-Version: 2.1\nName: shmmap\nVersion: {version}\n",
-        f"{about}/WHEEL": "Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: py3-none-any\n",
-        f"{about}/entry_points.txt": "[console_scripts]\nshmmap = shmmap.cli:main\n"
-        "shmmapd = shmmap.cli:serve_main\n",
-    }
-    for folder, inside in folders.items():
-        for path in (ROOT / folder).rglob("*"):
-            if path.is_file() and "__pycache__" not in path.parts:
-                texts[f"{inside}/{path.relative_to(ROOT / folder)}"] = path.read_text(encoding="utf-8")
-    file = "shmmap/version.py"
-    texts[file] = texts[file].replace(f'"{shmmap.__version__}"', f'"{version}"')
-    texts[f"{about}/RECORD"] = "".join(f"{name},,\n" for name in [*texts, f"{about}/RECORD"])
-    with zipfile.ZipFile(built, "w") as archive:
-        for name, text in texts.items():
-            archive.writestr(name, text)
-    return built
-
-
-def pip_install(machine: BootedSystemd, built: Path) -> None:
-    """``pip install`` a wheel into the environment of the service."""
-    pip = f"{sys.executable} -m pip --python {PLACE}/bin/python install -q --no-deps --no-index"
-    machine.shell(f"unset PYTHONPATH; {pip} /exchange/{built.name} 2>&1")
-
-
 @pytest.fixture
 def installed(fresh: BootedSystemd) -> Iterator[BootedSystemd]:
-    """A service of an environment of its own, with the packages of this one."""
-    wheels = [wheel(fresh.shared, version) for version in ("0.90.0", "0.91.0")]
-    packages = sysconfig.get_path("purelib")
+    """A service of an environment of its own."""
+    wheels = [make_wheel(fresh.shared, version) for version in ("0.90.0", "0.91.0")]
+    make_environment(fresh, PLACE)
+    pip_install(fresh, wheels[0], PLACE)
     fresh.shell(f"""
         unset PYTHONPATH
-        {sys.executable} -m venv --without-pip {PLACE}
-        echo {packages} >"$({PLACE}/bin/python -c 'import site; print(site.getsitepackages()[0])')/others.pth"
         cp {SETTINGS} /root/settings
-    """)
-    pip_install(fresh, wheels[0])
-    fresh.shell(f"""
-        unset PYTHONPATH
         {PLACE}/bin/shmmap unit install --map {MAP}
         sed -i '1i live_group = "shmmap"' {SETTINGS}
         printf '\n[live.lidar]\nresolution = 0.5\n' >>{SETTINGS}
@@ -153,7 +117,7 @@ def test_an_upgrade_under_running_programs(installed: BootedSystemd) -> None:
     try:
         before = {says(what)[0] for what in programs}
         assert len(before) == 1
-        pip_install(machine, machine.shared / "shmmap-0.91.0-py3-none-any.whl")
+        pip_install(machine, machine.shared / "shmmap-0.91.0-py3-none-any.whl", PLACE)
         done = machine.shell(f"unset PYTHONPATH; {PLACE}/bin/shmmap unit install; {PLACE}/bin/shmmap version")
         assert "next: systemctl restart shmmapd\n" in done
         assert "0.91.0" in done

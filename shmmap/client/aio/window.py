@@ -223,6 +223,9 @@ class MapWindow(WindowView):
     async def wait_until_current(self, timeout: float) -> bool:
         """Wait until the window answers the latest pose and nothing is being loaded.
 
+        Cells that cannot be loaded (see `WindowUpdate.failed`) do not prolong the wait, except cells that
+        wait for memory or for an unreachable origin.
+
         Returns
         -------
         bool

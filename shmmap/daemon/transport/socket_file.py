@@ -132,7 +132,7 @@ def _answers(path: str) -> int | None:
                 return pid if pid > 0 and os.path.exists(f"/proc/{pid}") else _owner(path)
             except FileNotFoundError:
                 return None
-            except ConnectionRefusedError:  # a leftover, unless somebody has bound it and is about to listen
+            except ConnectionRefusedError:  # a leftover, unless a process has bound it and is about to listen
                 return _owner(path) or None
             except OSError as error:
                 if error.errno != errno.EPROTOTYPE:  # EPROTOTYPE: another type of socket

@@ -19,6 +19,7 @@ from tests.support.forked_programs import run_verb
 from tests.support.live_drive import drive as live_drive
 from tests.support.live_reference import LiveDaemon, held, reference
 from tests.support.ndt_programs import TownDrive, make_town_drive
+from tests.support.pages import read_page, reader_with_programs
 
 pytest.importorskip("rosbags", reason="rosbags is not installed")
 
@@ -170,3 +171,25 @@ def test_a_live_map(live_daemon: LiveDaemon, tmp_path: Path) -> None:
     refused = run_verb([*words, "--resume"], module="shmmap_clients.rolling_map")
     assert refused.returncode == 2
     assert "--resume is for a directory of scans" in refused.stderr
+
+
+def test_the_page_s_commands(drive: TownDrive, daemon: DaemonFactory, tmp_path: Path) -> None:
+    """A pose of this drive stands for the page's."""
+    one = daemon(drive.map_dir)
+    stamps = [n * 25 * 10**7 for n in range(FRAMES)]
+    numbers = numbers_of(drive.truth)
+    entries = [("/lidar", at, cloud(xyz, at)) for at, xyz in zip(stamps, scans_of(drive), strict=True)]
+    entries += [
+        ("/localization/kinematic_state", at, bags.odometry(row[1:], at))
+        for at, row in zip(stamps, numbers, strict=True)
+    ]
+    write_bag(tmp_path / "drive", entries)
+    follow, pose_init, compare = read_page("clients/README.md").commands("bags")
+    x, y, _, _, _, yaw = drive.poses[50]  # after 12.5 s
+    with reader_with_programs(tmp_path, SHMMAP_ENDPOINT=one.endpoint, SHMMAP_SHM_DIR=one.shm_dir) as reader:
+        user = reader.terminal()
+        user.run(follow)
+        followed = read_trajectory(tmp_path / "poses.txt").T_map_sensor
+        assert pose_errors(followed, read_trajectory(drive.truth).T_map_sensor)[0].max() < 0.2
+        user.run(pose_init.replace("17,77,0,0,0,0.1", f"{x + 1},{y - 1},0,0,0,{yaw + 0.05}"))
+        assert user.run(compare)

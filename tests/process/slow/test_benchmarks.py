@@ -87,6 +87,15 @@ def test_without_data_they_say_how_to_make_some() -> None:
     assert sorted(ended) == NEED_DATA
 
 
+def test_one_is_run_by_its_name() -> None:
+    """The page's own command; its limits are those of memory, which other work does not change."""
+    (command,) = PAGE.commands("one")
+    *python, name = command.split()
+    assert python == ["python", "-m"]
+    code, printed, errors = started(name.rpartition(".")[2])["memory"]
+    assert not code, printed + errors
+
+
 def test_every_row_of_what_once_held_others_up_has_a_scene() -> None:
     _, listed, _ = started("hostile_p99 --list")["hostile_p99"]
     rows = [f"A{number}" for number in (*range(1, 10), 11, 12, 13, 16, 17, *range(21, 25))] + ["B3"]

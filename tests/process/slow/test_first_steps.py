@@ -29,7 +29,7 @@ from tests.support.pages import Reader, Terminal, read_page, write_program
 README = read_page("README.md")
 INSTALL = read_page("shmmap/INSTALL.md")
 CLONE = README.commands("clone")
-(FULL,) = (line for line in README.text.splitlines() if line.endswith(" && shmmap demo"))
+(FULL,) = README.commands("demo")
 (SLIM,) = INSTALL.commands("slim")
 pytestmark = [pytest.mark.minutes, pytest.mark.more_as_root]  # other Pythons may lie in root's home
 WITHOUT_OPEN3D, WHOLE = "python3.10", "python3.13"

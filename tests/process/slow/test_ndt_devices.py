@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from tests.process.conftest import DaemonFactory
 from tests.support.forked_programs import run_verb
 from tests.support.ndt_programs import TownDrive, town_drive_once
 from tests.support.opencl_device import need_device
+from tests.support.pages import read_page
 
 NDT = "shmmap_clients.ndt_scan_matcher"
 POSE_INIT = "shmmap_clients.pose_initializer"
@@ -32,6 +34,14 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> TownDrive:
 def run(module: str, *words: str) -> tuple[int, Any, str]:
     done = run_verb(words, module=module)
     return done.returncode, json.loads(done.stdout) if done.stdout else None, done.stderr
+
+
+def test_the_page_s_command_lists_what_there_is() -> None:
+    """Its first two lines install what the machine of this test has already."""
+    (command,) = (line for line in read_page("clients/README.md").commands("device") if "shmmap-ndt" in line)
+    done = run_verb(shlex.split(command, comments=True)[1:], module=NDT)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout
 
 
 def follow(drive: TownDrive, one: Any, lines: Path) -> list[str]:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +19,7 @@ from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import DaemonProcess
 from tests.support.forked_programs import run_verb
 from tests.support.ndt_programs import TownDrive, make_town_drive
+from tests.support.pages import read_page
 from tests.support.ros.processes import Publication, RosDomain, RosPeer, RosProgram
 
 FRAMES: Final = 24
@@ -29,6 +31,9 @@ WINDOW: Final = ["--map-radius", "200", "--lidar-radius", "80", "--update-distan
 CLOUD: Final = "sensor_msgs/msg/PointCloud2"
 POSE: Final = "geometry_msgs/msg/PoseWithCovarianceStamped"
 TF: Final = "tf2_msgs/msg/TFMessage"
+(COMMAND,) = read_page("clients/README.md").commands("topic")
+PROGRAM, VERB, OPTION, TOPIC, *OPTIONS = shlex.split(COMMAND)
+assert (PROGRAM, VERB, OPTION) == ("shmmap-ndt", "follow", "--topic")
 
 
 @pytest.fixture(scope="module")
@@ -94,11 +99,11 @@ class Vehicle:
         self.truth = read_trajectory(drive.truth).T_map_sensor
         static = self.peer.advertised(TF, "/tf_static", latched=True)
         static.send(**edge("base_link", "lidar", MOUNTED))
-        self.scans: Publication = self.peer.advertised(CLOUD, "/points")
+        self.scans: Publication = self.peer.advertised(CLOUD, TOPIC)
         self.guesses: Publication = self.peer.advertised(POSE, "/initialpose")
         self.poses = self.peer.subscribed(POSE, "/ndt_pose_with_covariance", latched=False)
         given = ["--endpoint", daemon.endpoint, "--shm-dir", daemon.shm_dir, *WINDOW, "--min-range", "0"]
-        given += ["--topic", "/points", "--json", "--json-lines", str(folder / "lines")]
+        given += ["--topic", TOPIC, "--json", "--json-lines", str(folder / "lines")]
         program = [MODULE, "follow", *given, *words]
         self.program = RosProgram(domain, program, output=folder / "summary", numba=True)
 
@@ -126,7 +131,7 @@ class Vehicle:
     def begin(self, number: int = 0) -> None:
         """Have scans reach the program, which only takes them after the guess."""
         self.scan(FRAMES - 1, self.scans.repeat)
-        self.program.wait_said("scans of /points come in frame 'lidar'")
+        self.program.wait_said(f"scans of {TOPIC} come in frame 'lidar'")
         self.scans.rest()
         self.guess(self.truth[number])
         self.program.wait_said("localizes from the pose on /initialpose")
@@ -151,8 +156,8 @@ def test_poses_are_those_of_files(
 ) -> None:
     """From the guess on, scan by scan; with the transform that makes the vehicle's pose of its odometry."""
     one = daemon(drive.map_dir)
-    tf = ["--publish-tf", "--ros-args", "-p", "use_sim_time:=true"]
-    vehicle = Vehicle(domain, one, drive, tmp_path, *tf)
+    assert "--publish-tf" in OPTIONS
+    vehicle = Vehicle(domain, one, drive, tmp_path, *OPTIONS)
     seen = vehicle.peer.subscribed(TF, "/tf", latched=False)
     moving = vehicle.peer.advertised(TF, "/tf")
     clock = vehicle.peer.advertised("rosgraph_msgs/msg/Clock", "/clock")
@@ -227,5 +232,5 @@ def test_it_ends_while_it_waits(
     vehicle = Vehicle(domain, daemon(drive.map_dir), drive, tmp_path)
     vehicle.program.wait_said("waiting for a pose on /initialpose")
     assert vehicle.program.end(signal.SIGINT) == 1
-    assert "no scan came from /points" in vehicle.program.log
+    assert f"no scan came from {TOPIC}" in vehicle.program.log
     assert "Traceback" not in vehicle.program.log

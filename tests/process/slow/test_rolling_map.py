@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -26,6 +27,7 @@ from tests.support.daemon_process import DaemonProcess, Deadline
 from tests.support.forked_programs import run_verb
 from tests.support.live_drive import FILTER, RESOLUTION, Voxel, drive
 from tests.support.live_reference import LiveDaemon, held, reference, worker_of
+from tests.support.pages import read_page, reader_with_programs
 
 PROGRAM = [sys.executable, "-m", "shmmap_clients.rolling_map"]
 LONG_S = 120.0
@@ -362,3 +364,16 @@ def test_nothing_found_exits_1(live_daemon: LiveDaemon, words: Words, tmp_path: 
             process.kill()
     assert process.returncode == 1
     assert f"no scan came from {source}" in err
+
+
+def test_the_page_s_commands(tmp_path: Path) -> None:
+    """A live map alone, a drive into it, and settings from a parameter file of Rolling-Bonxai."""
+    page = read_page("clients/README.md")
+    (serve,), (map_it,), (config,) = map(page.commands, ("live", "rolling", "rolling-config"))
+    write_drive(tmp_path, 6)
+    (tmp_path / "rolling_map_params.yaml").write_text("m_resolution: 0.3\n", encoding="utf-8")
+    with reader_with_programs(tmp_path) as reader, reader.terminal().serving(serve):
+        user = reader.terminal()
+        assert re.search(r"[1-9][\d,]* voxels known", user.run(map_it.replace("SCANS", "scans")))
+        assert ElementTree.parse(tmp_path / "map.svg").getroot().tag == f"{SVG}svg"
+        assert user.run(config).startswith("[live.lidar]\n")

@@ -315,7 +315,6 @@ def test_other_names(served: DaemonProcess, dds: int, peer: RosPeer) -> None:
 def test_the_page_is_true(served: DaemonProcess, dds: int, peer: RosPeer) -> None:
     """Its command starts a bridge, and every service and topic that it names is there."""
     page = read_page("clients/shmmap_clients/ros_bridge/ROS_BRIDGE.md")
-    assert set(page.blocks) == {"bridge"}
     (command,) = page.commands("bridge")
     program, *words = command.split()
     assert program == "shmmap-ros-bridge"

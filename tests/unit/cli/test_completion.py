@@ -7,17 +7,23 @@ After a change of verbs or options, ``python -m tests.unit.cli.test_completion``
 from __future__ import annotations
 
 import argparse
+import os
 import re
 import shutil
 import subprocess
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
 from shmmap.cli.entry import VERBS, build_parser
 from shmmap.cli.verbs.run.completion import SHELLS, script_of
+from tests.support.daemon_process import ROOT
+from tests.support.pages import read_page, write_program
 from tests.unit.conftest import Verb
 
+COMPLETION = read_page("shmmap/INSTALL.md").commands("completion")
 DIRECTORIES = {"DIR", "KEYDIR"}
 FILES = {"FILE", "FILE.png", "IN", "MAP", "OUT", "PATH", "ROOT.json"}
 
@@ -85,6 +91,27 @@ def test_bash_completes_verbs_and_options() -> None:
     assert {"status", "stop"} & set(completed("shmmap", "st")) == {"status", "stop"}
     assert completed("shmmap", "completion", "f") == ["fish"]
     assert "--prepare" in completed("shmmap", "serve", "--pre")
+
+
+@pytest.mark.parametrize("shell", SHELLS)
+def test_the_line_of_a_start_file(shell: str, tmp_path: Path) -> None:
+    """As the page has it; zsh's comes after compinit."""
+    if shutil.which(shell) is None:
+        pytest.skip(f"no {shell}")
+    write_program(tmp_path / "shmmap", f'exec "{sys.executable}" -m shmmap.cli "$@"')
+    (line,) = (line for line in COMPLETION if f"completion {shell}" in line)
+    before = "autoload -Uz compinit && compinit -u -D; " if shell == "zsh" else ""
+    there = {"bash": "complete -p shmmap", "zsh": "echo $_comps[shmmap]", "fish": "complete -c shmmap"}
+    environment = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [shell, "-c", f"{before}{line}\n{there[shell]}"],
+        capture_output=True,
+        text=True,
+        env={**environment, "HOME": str(tmp_path)},
+        timeout=60,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "shmmap" in done.stdout
 
 
 @pytest.mark.parametrize("shell", ["zsh", "fish"])

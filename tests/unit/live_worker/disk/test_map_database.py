@@ -7,7 +7,6 @@ import errno
 import json
 import os
 import random
-import re
 import shutil
 import sqlite3
 import struct
@@ -33,6 +32,7 @@ from shmmap.live_worker.disk.map_record import MapSettings, Row
 from shmmap.live_worker.disk.rebuilding import finish_replacing, replace_database
 from shmmap.mounts import Mount
 from tests.support.odd_files import ODD_FILES, failing
+from tests.support.pages import read_page
 from tests.support.stored_chunks import (
     PAGE,
     change_chunk,
@@ -173,14 +173,13 @@ def test_the_database_is_as_the_page_says(tmp_path: Path) -> None:
     header = (tmp_path / "map.db").read_bytes()[:100]
     assert header[:20] == b"SQLite format 3\0" + bytes.fromhex("1000 0202"), "pages of 4096 bytes, WAL"
     assert (header[60:64], header[68:72]) == (bytes([0, 0, 0, 1]), b"SHML")
-    page = (Path(map_database.__file__).parents[2] / "chunks" / "CHUNKS.md").read_text(encoding="utf-8")
-    (tables,) = re.findall(r"```sql\n(.*?)\n```", page, re.DOTALL)
+    tables = read_page("shmmap/chunks/CHUNKS.md").blocks["tables"]
     with database(tmp_path) as reader:
         found = [text for (text,) in reader.execute("select sql from sqlite_master order by rowid")]
         rows = reader.execute("select id, key, version, bytes, data from chunks").fetchall()
         ((number, record),) = reader.execute("select * from map").fetchall()
         padded = reader.execute("select padding from chunks").fetchall()
-    assert [text.lower() for text in found] == tables.splitlines()
+    assert [text.lower() for text in found] == tables
     assert rows == [(1, "0_0_0", 3, len(saved), saved)]
     assert not any(padded[0][0])
     assert number == 0
