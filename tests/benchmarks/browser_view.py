@@ -142,7 +142,7 @@ def main() -> None:
     )
     parser.add_argument("map", type=Path)
     parser.add_argument("--cache-dir", required=True)
-    parser.add_argument("--places", type=int, default=20)
+    parser.add_argument("--places", type=int, default=20, help="0: the drives alone")
     parser.add_argument("--most", type=float, default=60.0, help="seconds that a place may take")
     parser.add_argument("--drive", type=float, default=30.0)
     arguments = parser.parse_args()
@@ -177,9 +177,10 @@ def main() -> None:
                         f" {amounts[-1]:.1f} MB, a move of 5 m {moves[-1]:.2f} MB",
                         flush=True,
                     )
-        print(f"first cell: median {statistics.median(firsts):.2f} s, most {max(firsts):.2f} s")
-        print(f"a place: median {statistics.median(amounts):.1f} MB, most {max(amounts):.1f} MB")
-        print(f"a move of 5 m: median {statistics.median(moves):.2f} MB, most {max(moves):.2f} MB")
+        if firsts:
+            print(f"first cell: median {statistics.median(firsts):.2f} s, most {max(firsts):.2f} s")
+            print(f"a place: median {statistics.median(amounts):.1f} MB, most {max(amounts):.1f} MB")
+            print(f"a move of 5 m: median {statistics.median(moves):.2f} MB, most {max(moves):.2f} MB")
     for seen in (False, True):
         one = DaemonProcess(arguments.map, "--cache-dir", arguments.cache_dir, forked=False)
         with one:
