@@ -60,7 +60,6 @@ from typing import Any, Final
 import numpy as np
 
 import shmmap
-from shmmap.statistics.reader import read_statistics
 from tests.benchmarks.catalogue import run_measure
 from tests.benchmarks.hostile.actors import Actor, works
 from tests.benchmarks.hostile.beside import OVER_ECHO_MS, Beside, Turns
@@ -184,8 +183,8 @@ def measure_reload(
         row["reload"] = took_s
         row["same work"] = worker.end()[1]
         row["turn in it"] = beside.turns.quantile_and_longest_ms(1.0)[1]
-    events = read_statistics(one.instance, one.shm_dir)
-    report.must("there was one", events.counters["reloads"] == 1)
+    with shmmap.connect(one.endpoint, timeout=120.0) as client:
+        report.must("there was one", client.stats().counters["reloads"] == 1)
     row["probe"], row["echo"] = float(report.figures["probe"]), float(report.figures["echo"])
     row["peak then"] = peak_bytes(one.pid) / 1e6
     row["daemon then"] = resident_bytes(one.pid) / 1e6
