@@ -63,7 +63,7 @@ RUN = {  # what runs the blocks of a page, by their names
         "tests/unit/cli/test_completion.py": "completion",
         INSTALLS: "versions",
     },
-    "shmmap/chunks/CHUNKS.md": {"tests/unit/daemon/live/test_map_files.py": "tables"},
+    "shmmap/chunks/CHUNKS.md": {"tests/unit/live_worker/disk/test_map_database.py": "tables"},
     "shmmap/client/MULTIPROCESSING.md": {
         "tests/process/slow/test_pickled_cells.py": "pool ask together keep"
     },
