@@ -4,7 +4,8 @@
     python -m tests.benchmarks.map_switch [--cells N] [--segments N] [--against ../other] [--pairs 3]
 
 The cache of a daemon serves such a map, with segments for cells all over it; their files are not
-made, as no loader reads them.  Then another state of the map is served: a file changed, eight, all, or a cell more.
+made, as no loader reads them.  Then another state of the map is served: a file changed, eight, all, or a cell
+more.
 Printed are, for layers of single cells and for a layer that reads the cells around, the processor time of the
 step that serves it and of the longest step after it, milliseconds; and of all steps together, until no
 segment is left to be checked.  With ``--against``, another checkout's version takes turns with this one, and

@@ -39,8 +39,8 @@ class MapSwitch:
     requested in the meantime is checked at once (`CellCache.find_warm`).  If few cells have changed, only
     their segments are checked; if many have, or cells have new numbers, all that are in memory.
 
-    All cells get other numbers when one is added or removed.  Fixed numbers would need a table of the order of
-    ids, and spare no mechanism: a map whose files were all rewritten, and another version of a published
+    All cells get other numbers when one is added or removed.  Fixed numbers would need a table of the order
+    of ids, and spare no mechanism: a map whose files were all rewritten, and another version of a published
     map, need the check of all segments in any case.
     """
 
