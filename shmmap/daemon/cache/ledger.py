@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from typing import Final
 
-from shmmap.daemon.cache.eviction_order import EvictionOrder
+from shmmap.daemon.cache.eviction_plan import Evictable
 from shmmap.daemon.records import Key, Resident, Retired
 from shmmap.large_tables import ShardedDict
 
@@ -92,8 +92,8 @@ class Ledger:
         Segments out of service, by their original name.
     segments
         All segments in memory, retired ones included.
-    order
-        Order in which residents are evicted.
+    evictable
+        What has changed about which residents can be evicted.
     retired_bytes, freeing_bytes
         Memory of retired segments, and the part of it that the kernel is taking back now.
     unopened_bytes
@@ -114,7 +114,7 @@ class Ledger:
         self.retired: dict[str, Retired] = {}
         self.resident_bytes = 0
         self.segments = Segments()
-        self.order = EvictionOrder()
+        self.evictable = Evictable()
         self.retired_bytes = 0
         self.freeing_bytes = 0
         self.unopened_bytes = 0
@@ -194,7 +194,7 @@ class Ledger:
         if count:
             self._needed[key] = count
         elif key in self.by_key:
-            self.order.reconsider(self.by_key[key])
+            self.evictable.add(self.by_key[key])
 
     def needed(self) -> Iterable[Key]:
         """Return the keys that requests or pins need."""
@@ -217,8 +217,7 @@ class Ledger:
             self.prefetched[resident] = None
             self.prefetched_bytes += resident.nbytes
         self.segments.add(resident)
-        self.order.new[resident] = None
-        self.order.changes += 1
+        self.evictable.add(resident)
         if old is not None:
             self._leave_service(old)
         return old
@@ -248,7 +247,7 @@ class Ledger:
         self.unchecked_count -= not resident.checked
         self._not_ahead(resident)
         self.resident_bytes -= resident.nbytes
-        self.order.leave(resident)
+        self.evictable.leave(resident)
         self.retired_bytes += resident.nbytes
         self.retired[resident.name] = Retired(resident)
 

@@ -15,6 +15,7 @@ from collections import deque
 from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
+from shmmap.daemon.cache.evictor import Freeing
 from shmmap.daemon.loading.link import Link
 from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.loading.look_ahead import URGENT_S, Prefetch
@@ -202,7 +203,7 @@ class Prefetcher:
         index = self._cache.index_of(load.key.cell_id)
         if index is not None:
             wished = self._wished(load.key, index, load.estimate)
-            if self._evictor.free(shortage, now_s, rather_than=wished):
+            if self._evictor.free(shortage, now_s, rather_than=wished) is not Freeing.NO_MORE:
                 return True
         self.full(now_s)
         return False
