@@ -32,15 +32,13 @@ from shmmap.large_tables import ShardedDict
 PREFETCHED_PER_TURN: Final = 64
 """Prefetched segments compared with a wish at a time: a tenth of a millisecond."""
 PRESSURE_S: Final = 10.0
-"""How long plans are made after memory was short."""
+"""How long plans are made after memory was short.  A load helps to replace an outdated plan that is older."""
 FREE_SHARE: Final = 8
 """Divisor: the first plan is made when less than 1/8 of the budget is free."""
 PLAN_S: Final = 0.25
 """Shortest interval of plans that no load waits for."""
 STEP_S: Final = 0.008
 """Interval of their steps: they take a twentieth of a core at most."""
-MAX_AGE_S: Final = 1.0
-"""Age of an outdated plan from which each load that needs memory makes a part of the next one."""
 LOOKS_PER_CALL: Final = 4
 """Segments looked at by one `Evictor.free`: a look takes 15 us, and retiring one is as much work again."""
 
@@ -88,7 +86,7 @@ class Evictor:
             return Freeing.ENOUGH
         self._pressure_until_s = now_s + PRESSURE_S
         ledger.evictable.look_again(now_s)
-        if self._plan.listed and now_s >= self._plan.now_s + MAX_AGE_S and self._is_outdated:
+        if self._plan.listed and now_s >= self._plan.now_s + PRESSURE_S and self._is_outdated:
             self.run_step(now_s)
         for _ in range(LOOKS_PER_CALL):
             first = self._first(now_s)
@@ -173,9 +171,7 @@ class Evictor:
 
         The first plan is made before.
         """
-        ledger = self.reclaimer.ledger
-        is_first = self._plan.now_s == -math.inf and ledger.shortage(ledger.budget_bytes // FREE_SHARE) > 0
-        if self._stepped_s >= self._pressure_until_s and not is_first:
+        if self._stepped_s >= self._pressure_until_s and not self._will_be_needed:
             return math.inf
         if self._making is not None:
             return self._stepped_s + STEP_S
@@ -191,6 +187,12 @@ class Evictor:
             self._making = self._next.make(ledger.segments.walk(), lambda one: self._may_go(one, now_s))
         if next(self._making, self) is self:
             self._plan, self._making = self._next, None
+
+    @property
+    def _will_be_needed(self) -> bool:
+        """Whether there is no plan yet, and memory will soon be short."""
+        ledger = self.reclaimer.ledger
+        return self._plan.now_s == -math.inf and ledger.shortage(ledger.budget_bytes // FREE_SHARE) > 0
 
     @property
     def _is_outdated(self) -> bool:

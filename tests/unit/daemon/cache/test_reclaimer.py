@@ -336,7 +336,7 @@ def test_clients_decide_soon_after_they_have_moved(memory: Memory) -> None:
     evictor.run_step(later_s)
     drive_to(1200.0)
     assert evictor.next_s == float("inf"), "there was enough memory for long"
-    evictor.free(memory.ledger.coming_bytes + SMALL, later_s + 5.0)
+    evictor.free(memory.ledger.coming_bytes + SMALL, later_s + PRESSURE_S)
     assert [*memory.ledger.retired.values()][-1].resident is some[-5], "an old plan is replaced before"
 
 
