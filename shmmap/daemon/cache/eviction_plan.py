@@ -14,28 +14,19 @@ from bisect import insort
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import count, islice
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.daemon.records import Resident
 from shmmap.daemon.travel.places import NOWHERE, PAIRS_PER_BLOCK, Places, until_needed
-from shmmap.large_tables import ShardedDict
 
 MAX_LISTED: Final = 4096
 BLOCK: Final = 128
 """Segments looked at in a step: 0.2 to 0.4 ms; fewer where there are many places."""
-DUE_PER_CALL: Final = 16
 HAND_OUT_GRACE_S: Final = 1.0
 """A segment that was just handed out is not evicted for this long, so that its reader can open it."""
-IN_USE_S: Final = 0.2
-"""How long, at least, a segment found in use is left alone.  The time doubles with each look if the kernel
-reports when a process closes the segment."""
-MAX_IN_USE_S: Final = 5.0
-"""... and how long at most: a precaution."""
-SHARE_S: Final = 0.0005
-"""Minimum time between two looks when very many segments are mapped (a look takes 15 us)."""
 MAX_SCORE: Final = 1e12
 """Score of what will never be needed; finite, so that scores can be compared."""
 SPARE_SCORE: Final = 1e15
@@ -150,72 +141,3 @@ class EvictionPlan:
             is_past_grace = self.now_s - resident.last_use_s >= HAND_OUT_GRACE_S
             rank = (is_past_grace, not resident.sessions, is_past_grace and score, unused)
             yield Candidate(*rank, next(_numbers), resident)
-
-
-class Evictable:
-    """What has changed about which residents can be evicted.
-
-    Attributes
-    ----------
-    new : ShardedDict
-        Segments that entered service or were released since the last plan was begun.
-    changes : int
-        How often that happened.
-    """
-
-    def __init__(self) -> None:
-        self.changes = 0
-        self.new: ShardedDict[Resident, object] = ShardedDict()
-        self._in_use: ShardedDict[Resident, Any] = ShardedDict()  # until when it is left alone, and how long
-        self._heap: list[tuple[float, int, Resident]] = []
-
-    def add(self, resident: Resident) -> None:
-        """Note that a segment entered service, or that a request or pin needs it no more."""
-        self.new[resident] = None
-        self.changes += 1
-
-    def leave(self, resident: Resident) -> None:
-        """Forget a segment that left service."""
-        self.new.pop(resident, None)
-        self._in_use.pop(resident, None)
-
-    def release(self, resident: Resident) -> bool:
-        """Note that a user has released a segment; return whether it had been found in use."""
-        was_in_use = self._in_use.pop(resident, None) is not None
-        self.add(resident)
-        return was_in_use
-
-    def release_all(self) -> None:
-        """Note that any segment that was found in use may have been released."""
-        few, many = self.new, self._in_use
-        if len(few) > len(many):
-            few, many = many, few
-        many.update(few)  # the smaller table is merged into the larger one
-        self.new, self._in_use, self._heap = many, ShardedDict(), []
-        self.changes += 1
-
-    def found_in_use(self, resident: Resident, now_s: float, *, is_watched: bool) -> None:
-        """Leave a segment alone for a while; ``is_watched``: the kernel reports its next close."""
-        last_s = self._in_use.get(resident, (0.0, 0.0))[1]
-        for_s = min(max(IN_USE_S, 2.0 * last_s * is_watched), MAX_IN_USE_S)
-        until_s = now_s + max(for_s, SHARE_S * len(self._in_use))
-        self._in_use[resident] = until_s, for_s
-        heapq.heappush(self._heap, (until_s, next(_numbers), resident))
-
-    def is_left_alone(self, resident: Resident, now_s: float) -> bool:
-        """Whether a segment was found in use a moment ago."""
-        known = self._in_use.get(resident)
-        return known is not None and now_s < known[0]
-
-    def next_look_s(self) -> float:
-        """Return when the first of the segments found in use is looked at again, at the earliest."""
-        return self._heap[0][0] if self._heap else math.inf
-
-    def look_again(self, now_s: float) -> None:
-        """Consider some of the segments again that have been left alone for long enough."""
-        for _ in range(DUE_PER_CALL):
-            if self.next_look_s() > now_s:
-                break
-            until_s, _, resident = heapq.heappop(self._heap)
-            if self._in_use.get(resident, (0.0, 0.0))[0] == until_s:
-                self.new[resident] = None

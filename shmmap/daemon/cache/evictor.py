@@ -90,10 +90,11 @@ class Evictor:
             self.run_step(now_s)
         for _ in range(LOOKS_PER_CALL):
             first = self._first(now_s)
-            if first is None and self._making is None:
-                return Freeing.NO_MORE
-            if first is None:
-                break
+            if first is None or not first.is_past_grace:
+                if self._list_more(now_s):
+                    break
+                if first is None:
+                    return Freeing.NO_MORE
             resident, graced_s = first.resident, first.resident.last_use_s + HAND_OUT_GRACE_S
             if rather_than is not None and not (
                 first.is_past_grace and first.score > self._plan.score(rather_than)
@@ -136,15 +137,10 @@ class Evictor:
         return work < LOOKS_PER_CALL
 
     def _first(self, now_s: float) -> Candidate | None:
-        """Return the candidate that goes first; None if there is none, or a plan is in the making."""
-        while True:
-            first = self._plan.first()
-            if first is not None and not self._may_go(first.resident, now_s):
-                self._plan.listed.pop()
-            elif (first is not None and first.is_past_grace) or not self._list_more(now_s):
-                return first
-            elif self._making is not None:
-                return None
+        """Return the candidate that goes first; those that may not go any more are dropped."""
+        while (first := self._plan.first()) is not None and not self._may_go(first.resident, now_s):
+            self._plan.listed.pop()
+        return first
 
     def _may_go(self, resident: Resident, now_s: float) -> bool:
         """Whether a segment is in service, not needed, and was not found in use a moment ago."""

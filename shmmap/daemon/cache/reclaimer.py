@@ -23,8 +23,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Final, Protocol
 
-from shmmap.daemon.cache.eviction_plan import SHARE_S
-from shmmap.daemon.cache.ledger import Ledger
+from shmmap.daemon.cache.ledger import SHARE_S, Ledger
 from shmmap.daemon.pins.probe import PinSource
 from shmmap.daemon.pins.watch import PinWatch
 from shmmap.daemon.records import Key, Resident, Retired

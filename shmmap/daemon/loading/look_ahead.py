@@ -4,7 +4,7 @@
 The area that a client asks for is moved along its path in steps: cells that enter it at a step are needed
 when the client arrives there.  The path is the route that the client sent.  Without a route, and beyond its
 end, the path continues straight ahead and, a little later, to both sides, because the client may turn; the
-longer the client has moved straight ahead, the farther.  All paths are looked along every `PASS_S`, some
+longer the client has moved straight ahead, the farther.  All paths are looked along again and again, a few
 steps at a time, and what is missing is listed in the order in which it is needed.  Whether a cell is still
 missing is asked again when its turn comes.
 
@@ -98,10 +98,12 @@ class OriginHealth:
         return again
 
 
-PASS_S: Final = 2.0
-"""Interval at which all paths are looked along."""
-EARLIEST_PASS_S: Final = 0.25
-"""... after a client has come or jumped, or if not all that is missing was listed."""
+PASS_S: Final = 0.5
+"""Shortest interval at which all paths are looked along."""
+STEP_S: Final = 0.002
+"""... for each step: it takes a twentieth of that."""
+LONGEST_PASS_S: Final = 2.0
+"""... and longest: what moves too fast for that is fetched late."""
 MAX_LISTED: Final = 4096
 """Cells listed if there are more than twice as many: those needed first."""
 SLOWEST_MPS: Final = 0.5
@@ -300,7 +302,8 @@ class Prefetch:
         self._listed: list[_Listed] = []
         self._making: Iterator[None] | None = None  # of the next list
         self._begun_s = -math.inf
-        self._is_due = False  # before `PASS_S` has passed
+        self._steps = 0
+        self._is_due = False  # sooner than that
 
     def follow(self, client: Hashable, motion: Motion, area: Area, layers: tuple[str, ...]) -> None:
         """Prefetch for a client, given its motion and its last requested area and layers."""
@@ -315,7 +318,7 @@ class Prefetch:
     def look_ahead(self) -> LookAhead:
         """Current look-ahead; cells beyond it are not wished for yet."""
         load_s = SLOW_LOADS * self.health.slow_s + SLACK_S
-        route_s = load_s + SPARE * self._outage_tolerance_s + PASS_S + AFTER_S
+        route_s = load_s + SPARE * self._outage_tolerance_s + LONGEST_PASS_S + AFTER_S
         straight_s = load_s + min(self._outage_tolerance_s, self._away_s, GUESSED_S)
         return LookAhead(route_s, straight_s, load_s)
 
@@ -328,7 +331,8 @@ class Prefetch:
         if now_s < self.health.next_try_s():
             return None
         if self._making is None and now_s >= self._next_pass_s:
-            self._begun_s, self._is_due, self._making = now_s, False, self._make(catalogue, now_s)
+            self._begun_s, self._steps, self._is_due = now_s, 0, False
+            self._making = self._make(catalogue, now_s)
         if self._making is not None and len(list(islice(self._making, LOOKS_PER_CALL))) < LOOKS_PER_CALL:
             self._making = None
         wish = self._read(reader, now_s)
@@ -370,6 +374,7 @@ class Prefetch:
                     first = sorted(found.values(), key=_needed_s)[:MAX_LISTED]
                     found, until_s = {one[1:3]: one for one in first}, first[-1].needed_s
                     self._is_due = True  # the others are listed next time
+                self._steps += 1
                 yield
         self._listed = sorted(found.values(), key=_needed_s)
 
@@ -399,7 +404,8 @@ class Prefetch:
 
     @property
     def _next_pass_s(self) -> float:
-        return self._begun_s + (EARLIEST_PASS_S if self._is_due else PASS_S)
+        interval_s = min(STEP_S * self._steps, LONGEST_PASS_S)
+        return self._begun_s + (PASS_S if self._is_due else max(PASS_S, interval_s))
 
 
 _needed_s = attrgetter("needed_s")

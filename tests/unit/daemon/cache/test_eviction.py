@@ -13,17 +13,13 @@ from hypothesis import strategies as st
 
 from shmmap.daemon.cache.eviction_plan import (
     BLOCK,
-    DUE_PER_CALL,
     HAND_OUT_GRACE_S,
-    IN_USE_S,
-    MAX_IN_USE_S,
     MAX_LISTED,
-    SHARE_S,
     SOON_S,
-    Evictable,
     EvictionPlan,
     eviction_scores,
 )
+from shmmap.daemon.cache.ledger import DUE_PER_CALL, IN_USE_S, MAX_IN_USE_S, SHARE_S, Evictable
 from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.travel.motion import Motion
 from shmmap.daemon.travel.places import PAIRS_PER_BLOCK, Places, merged_places, places_of, until_needed

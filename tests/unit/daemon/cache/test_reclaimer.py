@@ -388,5 +388,6 @@ def test_a_wish_takes_only_what_is_needed_later(memory: Memory) -> None:
     def free() -> Freeing:
         return memory.evictor.free(memory.ledger.coming_bytes + SMALL, NOW_S, rather_than=wish)
 
+    assert free() is Freeing.LATER, "first a plan is made"
     assert [free(), free(), free()] == [Freeing.ENOUGH, Freeing.ENOUGH, Freeing.NO_MORE]
     assert [one.resident for one in memory.ledger.retired.values()] == some[:2]

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from shmmap.daemon.loading import look_ahead
 from shmmap.daemon.loading.look_ahead import (
     BESIDE_M,
-    EARLIEST_PASS_S,
     IN_A_ROW,
+    LONGEST_PASS_S,
     LOOKS_PER_CALL,
     MAX_CELLS,
     PASS_S,
@@ -365,12 +365,12 @@ def test_what_has_failed_comes_first_in_the_next_pass() -> None:
     first = daemon.next(1.0)
     assert first is not None
     daemon.failed.add((first.cell, first.layer))
-    second = daemon.next(1.5)
+    second = daemon.next(1.1)
     assert second is not None
     assert second.cell != first.cell
     daemon.failed.clear()
     for _ in range(1000):
-        wish = daemon.next(1.0 + PASS_S)
+        wish = daemon.next(1.0 + LONGEST_PASS_S)
         assert wish is not None
         if wish.cell == first.cell:
             break
@@ -387,17 +387,17 @@ def test_after_a_jump_another_pass_begins_soon() -> None:
     move(motion, 1200.0, -300.0, 1.1)
     move(motion, 1210.0, -300.0, 2.1)
     daemon.prefetch.follow("a", motion, Circle(1210.0, -300.0, RADIUS_M), ("points",))
-    now_s = 1.0 + 0.9 * EARLIEST_PASS_S
+    now_s = 1.0 + 0.9 * PASS_S
     on_old_list = daemon.wishes(now_s)
     assert on_old_list
     assert min(town().box(wish.cell)[1] for wish in on_old_list) > 200.0 - 2.0 * RADIUS_M
-    assert daemon.next_s(now_s) == 1.0 + EARLIEST_PASS_S
-    found = daemon.wishes(1.0 + EARLIEST_PASS_S)
+    assert daemon.next_s(now_s) == 1.0 + PASS_S
+    found = daemon.wishes(1.0 + PASS_S)
     assert found
     assert all(town().box(wish.cell)[0] > 1200.0 for wish in found)
-    assert daemon.next_s(2.0) == 1.0 + EARLIEST_PASS_S + PASS_S
+    assert daemon.next_s(2.0) == 1.0 + 2.0 * PASS_S
     daemon.loading.clear()
-    assert daemon.next(2.0) is None, "the list has been read"
+    assert daemon.next(1.9) is None, "the list has been read"
 
 
 def test_in_an_outage_a_list_that_has_been_read_is_left_alone() -> None:
@@ -528,9 +528,9 @@ def test_of_very_many_cells_those_needed_first_are_listed_and_the_others_later(
     daemon.client("a")
     found = daemon.wishes(1.0)
     assert len(found) == 20
-    assert daemon.next_s(1.0) == 1.0 + EARLIEST_PASS_S
+    assert daemon.next_s(1.0) == 1.0 + PASS_S
     for number in range(1, 20):
-        found += daemon.wishes(1.0 + number * EARLIEST_PASS_S)
+        found += daemon.wishes(1.0 + number * PASS_S)
     monkeypatch.undo()
     all_at_once.client("a")
     assert [wish.cell for wish in found] == [wish.cell for wish in all_at_once.wishes(1.0)]
