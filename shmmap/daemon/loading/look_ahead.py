@@ -301,7 +301,7 @@ class Prefetch:
         self._away_s = 0.0
         self._listed: list[_Listed] = []
         self._making: Iterator[None] | None = None  # of the next list
-        self._begun_s = -math.inf
+        self._made_s = -math.inf
         self._steps = 0
         self._is_due = False  # sooner than that
 
@@ -331,10 +331,11 @@ class Prefetch:
         if now_s < self.health.next_try_s():
             return None
         if self._making is None and now_s >= self._next_pass_s:
-            self._begun_s, self._steps, self._is_due = now_s, 0, False
-            self._making = self._make(catalogue, now_s)
-        if self._making is not None and len(list(islice(self._making, LOOKS_PER_CALL))) < LOOKS_PER_CALL:
-            self._making = None
+            self._steps, self._is_due, self._making = 0, False, self._make(catalogue, now_s)
+        if self._making is not None:
+            if len(list(islice(self._making, LOOKS_PER_CALL))) == LOOKS_PER_CALL:
+                return None
+            self._making, self._made_s = None, now_s
         wish = self._read(reader, now_s)
         if wish is not None:
             self.health.tried(now_s)
@@ -342,7 +343,7 @@ class Prefetch:
 
     def restart(self) -> None:
         """Look along all paths again: more of the map along them is known now."""
-        self._catalogue, self._listed, self._making, self._begun_s = None, [], None, -math.inf
+        self._catalogue, self._listed, self._making, self._made_s = None, [], None, -math.inf
 
     def _read(self, reader: Reader, now_s: float) -> Wish | None:
         """Return the first cell of the list that a reader lacks; it passes over a bounded number."""
@@ -405,7 +406,7 @@ class Prefetch:
     @property
     def _next_pass_s(self) -> float:
         interval_s = min(STEP_S * self._steps, LONGEST_PASS_S)
-        return self._begun_s + (PASS_S if self._is_due else max(PASS_S, interval_s))
+        return self._made_s + (PASS_S if self._is_due else max(PASS_S, interval_s))
 
 
 _needed_s = attrgetter("needed_s")
