@@ -11,8 +11,6 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.parse import unquote, urlsplit
 
-__all__ = ["MAX_FIRST_PAGE_BYTES", "check_searches", "check_site", "found_by_search", "loaded_bytes"]
-
 MAX_FIRST_PAGE_BYTES: Final = 1_000_000
 
 

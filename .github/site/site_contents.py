@@ -11,8 +11,6 @@ import importlib.util
 from dataclasses import dataclass
 from typing import Final
 
-__all__ = ["API", "HERE", "NOT_PUBLIC", "PROGRAMS", "SEARCHES", "SECTIONS", "ApiPage"]
-
 HERE: Final = ".github/site"
 
 SECTIONS: Final = {

@@ -16,8 +16,6 @@ from sphinx.addnodes import pending_xref
 from sphinx.application import Sphinx
 from sphinx.transforms.post_transforms import SphinxPostTransform
 
-__all__ = ["setup"]
-
 
 def setup(app: Sphinx) -> dict[str, Any]:
     """Write names in full before Sphinx looks for them."""

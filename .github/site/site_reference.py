@@ -19,8 +19,6 @@ from site_staging import Tree, place, toctree
 from shmmap.cli.entry import GROUPS
 from shmmap.cli.entry import main as shmmap_main
 
-__all__ = ["add_reference", "help_text"]
-
 _COLUMNS: Final = "90"
 
 

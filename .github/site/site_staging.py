@@ -17,8 +17,6 @@ from typing import Final
 
 from site_contents import HERE, SECTIONS
 
-__all__ = ["Tree", "place", "stage", "toctree", "tracked_files"]
-
 _LINK: Final = re.compile(r"(\]\()([^)\s]+)(\))")
 _FENCED: Final = re.compile(r"^(```.*?^```$)", re.MULTILINE | re.DOTALL)
 _PICTURES: Final = (".svg", ".png")

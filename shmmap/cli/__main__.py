@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import sys
 
-from shmmap.cli.entry import main
+from shmmap.cli import main
 
 if __name__ == "__main__":
     sys.exit(main())

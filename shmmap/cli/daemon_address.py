@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import os
+from contextlib import closing
 from typing import TYPE_CHECKING, Final
 
 from shmmap.errors import NoAnswer, NoSocket, ProtocolMismatch, ShmmapError
@@ -161,11 +162,11 @@ def snapshot(args: argparse.Namespace) -> tuple[Snapshot, DaemonIdentity]:
     return found, found.identity
 
 
-def lists(args: argparse.Namespace, name: str = "shmmap") -> DaemonLists:
+def lists(args: argparse.Namespace, name: str = "shmmap") -> closing[DaemonLists]:
     """Return what asks the daemon for its clients and live maps, which its statistics lack."""
     from shmmap.doctor.daemon_lists import DaemonLists
 
-    return DaemonLists(name, endpoint(args))
+    return closing(DaemonLists(name, endpoint(args)))
 
 
 def connect_to(args: argparse.Namespace, found: Snapshot) -> Client:

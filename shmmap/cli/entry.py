@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Entry points of ``shmmap`` and ``shmmapd``: all verbs, parsing, and errors as exit codes."""
+"""Verbs of ``shmmap``: all of them, parsing, and errors as exit codes."""
 
 from __future__ import annotations
 
+import _signal as signal  # type: ignore[import-not-found]  # `signal` takes 2 ms to import
 import argparse
 import importlib
-import signal
 import sys
 from collections.abc import Sequence
 from typing import Any, Final
@@ -132,17 +132,8 @@ def build_parser(words: Sequence[str] = ()) -> argparse.ArgumentParser:
     return parser
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run one verb and return the exit code.
-
-    Parameters
-    ----------
-    argv
-        Words after the program's name; by default the arguments of this process, which then ends here if
-        threads have made requests.
-    """
-    if argv is None:
-        return _ended_by(sys.argv[1:])
+def main(argv: Sequence[str]) -> int:
+    """Run one verb and return the exit code; ``argv`` has the words after the program's name."""
     words = join_negative_values(verb_first(argv), NUMBER_OPTIONS)
 
     def run() -> int:
@@ -157,21 +148,3 @@ def main(argv: Sequence[str] | None = None) -> int:
         return code
 
     return exit_code_of("shmmap", run)
-
-
-def serve_main() -> int:
-    """Run ``shmmapd``, the same as ``shmmap serve``."""
-    return _ended_by(["serve", *sys.argv[1:]])
-
-
-def _ended_by(words: Sequence[str]) -> int:
-    """Run a verb as this process; see `shmmap.processes.request_threads.leave`."""
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        signal.signal(signal.SIGINT, signal.SIG_DFL)  # until the verb runs: an import would print a traceback
-    try:
-        code: object = main(words)
-    except SystemExit as ended:
-        code = ended.code or 0
-    if (threads := sys.modules.get("shmmap.processes.request_threads")) is not None:
-        threads.leave(code)
-    sys.exit(code)  # type: ignore[arg-type]

@@ -53,7 +53,7 @@ def at_least(lowest: int) -> Callable[[str], int]:
 
 def size_bytes(text: str) -> int:
     """Parse a size such as ``512M``; return bytes."""
-    from shmmap.daemon.config_table import parse_bytes
+    from shmmap.config_table import parse_bytes
 
     try:
         return parse_bytes(text)

@@ -21,21 +21,6 @@ from shmmap.compile_notices import watch
 from shmmap.errors import CannotWrite, InternalError, ShmmapError, ShmmapWarning
 from shmmap.formats.durable_file import writing_errors
 
-__all__ = [
-    "Parser",
-    "add_allow_empty",
-    "check_terminal",
-    "complain",
-    "exit_code_of",
-    "join_negative_values",
-    "keep_interrupts",
-    "nothing_found",
-    "output_file",
-    "write_text",
-    "writing_errors",
-]
-
-
 _EXIT_INTERRUPTED: Final = 130  # 128 + SIGINT, as in a shell
 
 _EXIT_BROKEN_PIPE: Final = 141  # 128 + SIGPIPE, as in a shell

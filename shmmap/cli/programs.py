@@ -42,9 +42,9 @@ from shmmap.cli.program import (
     nothing_found,
     output_file,
     write_text,
-    writing_errors,
 )
 from shmmap.cli.screens.output import counted, format_bytes, print_json, print_line, printable
+from shmmap.formats.durable_file import writing_errors
 
 __all__ = [
     "Parser",

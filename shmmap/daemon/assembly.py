@@ -28,7 +28,7 @@ from shmmap.daemon.host.signals import (
     StartSignals,
     ignore_signals,
 )
-from shmmap.daemon.live.relay import LiveRelay, NoLiveMaps
+from shmmap.daemon.live_relay import LiveRelay, NoLiveMaps
 from shmmap.daemon.map.catalogue_reload import Reloader, Reread
 from shmmap.daemon.map.file_watch import FileWatch, directories_of
 from shmmap.daemon.map_in_memory import MapInMemory

@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from shmmap.daemon.config_table import (
+from shmmap.config_table import (
     LARGEST_BYTES,
     Allowed,
     at_least,
@@ -41,7 +41,7 @@ else:
     import tomli as tomllib
 
 if TYPE_CHECKING:
-    from shmmap.daemon.config_live import LiveSettings
+    from shmmap.live_settings import LiveSettings
 
 SYSTEM_CONFIG_FILE: Final = "/etc/shmmap/shmmap.toml"
 MAX_BYTES: Final = 1 << 20
@@ -439,7 +439,7 @@ def _prepare(specs: tuple[str, ...], origin: str) -> Setting:
 
 def _live(tables: Setting, flags: Sequence[Setting]) -> Setting:
     """Combine the settings of live maps, including those named by variables or the command line."""
-    from shmmap.daemon.config_live import live_settings
+    from shmmap.live_settings import live_settings
 
     origins = [one.origin for one in (tables, *flags) if one.origin]
     names = [
@@ -541,7 +541,7 @@ def example_file(given: Mapping[str, Any]) -> str:
     """
     import textwrap
 
-    from shmmap.daemon.config_live import LIVE_ROWS
+    from shmmap.live_settings import LIVE_ROWS
 
     def comment(words: str, indent: str) -> str:
         return textwrap.fill(words, 110, initial_indent=indent, subsequent_indent=indent)

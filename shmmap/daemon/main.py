@@ -35,11 +35,10 @@ from typing import TYPE_CHECKING, Final
 
 from shmmap.daemon.assembly import Service
 from shmmap.daemon.config import DaemonConfig, option_of
-from shmmap.daemon.config_live import state_directory
 from shmmap.daemon.events.log import events_path
 from shmmap.daemon.host.instance import InstanceLock, lock_path, make_runtime_dir, stopped_early
 from shmmap.daemon.host.signals import StartSignals, ignore_signals
-from shmmap.daemon.live.relay import LiveEvents, LiveRelay, NoLiveMaps
+from shmmap.daemon.live_relay import LiveEvents, LiveRelay, NoLiveMaps
 from shmmap.daemon.loading.prepared_parent import fork_early
 from shmmap.daemon.map.catalogue_reload import Reloader
 from shmmap.daemon.map.catalogue_view import ViewOrigin
@@ -66,6 +65,7 @@ from shmmap.errors import CannotWrite, ConfigError, Replaced, ShmmapError
 from shmmap.failpoints import step
 from shmmap.installed import remember_modules
 from shmmap.lazy_imports import needed_packages
+from shmmap.live_settings import state_directory
 from shmmap.logfmt import log, set_up_logging
 from shmmap.origin.catalogue import NoMap
 from shmmap.origin.catalogue_bytes import default_cache_directory

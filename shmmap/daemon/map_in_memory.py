@@ -19,7 +19,6 @@ from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.config import DaemonConfig
-from shmmap.daemon.config_live import LiveSettings, live_directory
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.host.memory import (
     choose_budget,
@@ -28,7 +27,6 @@ from shmmap.daemon.host.memory import (
     room_bytes,
     usable_bytes,
 )
-from shmmap.daemon.live.messages import Begin
 from shmmap.daemon.loading.adoption import Adoption
 from shmmap.daemon.loading.link import Link
 from shmmap.daemon.loading.prepared_parent import Early, PreparedParent
@@ -43,10 +41,12 @@ from shmmap.daemon.requests.pending_request import WaitingList
 from shmmap.daemon.transport.sessions import Sessions
 from shmmap.daemon.turns import WatchedDescriptors
 from shmmap.errors import CannotStart, ConfigError
+from shmmap.live_messages import Begin
+from shmmap.live_settings import LiveSettings, live_directory
 from shmmap.logfmt import log
 from shmmap.mounts import mount_of
-from shmmap.segment.directory import DEFAULT_SHM_DIR, ShmDirectory, is_full
-from shmmap.segment.names import segment_prefix
+from shmmap.segment.directory import ShmDirectory, is_full
+from shmmap.segment.names import DEFAULT_SHM_DIR, segment_prefix
 from shmmap.segment.process_limits import limit_behind
 from shmmap.statistics.identity import DaemonIdentity, pid_namespace, start_time_ticks
 from shmmap.statistics.writer import StatisticsWriter

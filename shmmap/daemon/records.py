@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Records shared by all packages of the daemon: keys, resident and retired segments, loads, failures."""
+"""Records shared by all packages of the daemon: keys, resident and retired segments, failures."""
 
 from __future__ import annotations
 
-from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
@@ -71,47 +70,6 @@ class Retired:
     probe_after_s: float = 0.0
     interval_s: float = 0.0
     tick_over_s: float = 0.0
-
-
-@dataclass(slots=True, eq=False)
-class Load:
-    """A load that is queued or running; ``reserved`` bytes are promised to it while it runs.
-
-    ``adopted`` is a segment of a previous run that only has to be checked.  ``unless`` is the state of a file
-    that failed: in that state it is not loaded again.  ``wanted`` means that a client asked for it.
-    ``sources`` are the states of its file and its neighbours' files in the catalogue when a worker was given
-    the job, and ``version`` is the version that follows from them.  ``computed`` means that the layer is
-    computed, which may take long.  ``payer`` is the asker whose turn was used, ``charged_s`` the loader time
-    charged in advance, ``spent_s`` the loader time used, and ``took_s`` the total time, fetching included.
-    ``link_bytes`` is what it fetches from a remote origin.
-    ``losses`` counts loaders that were lost through no fault of this load.  ``prefetch`` means that no client
-    has asked for it yet, ``spare`` that only spare requests have, ``unread`` that its source could not be
-    read.
-    """
-
-    key: Key
-    estimate: int
-    priority: float
-    number: int
-    asker: Hashable = None
-    running: bool = False
-    reserved: int = 0
-    started_s: float = 0.0
-    adopted: Resident | None = None
-    unless: Stamp | None = None
-    wanted: bool = True
-    sources: tuple[Stamp, ...] = ()
-    version: int = 0
-    payer: Hashable = None
-    charged_s: float = 0.0
-    spent_s: float = 0.0
-    took_s: float = 0.0
-    link_bytes: int = 0
-    losses: int = 0
-    computed: bool = False
-    prefetch: bool = False
-    spare: bool = False
-    unread: bool = False
 
 
 @dataclass(slots=True)

@@ -42,7 +42,7 @@ from shmmap.demo.program import Progress
 from shmmap.processes.end_with_parent import with_us
 from shmmap.processes.interrupts import scratch_directory
 from shmmap.protocol.rows import CellRow
-from shmmap.segment.directory import DEFAULT_SHM_DIR
+from shmmap.segment.names import DEFAULT_SHM_DIR
 from shmmap.testing.daemon_process import DaemonProcess
 
 _PREFETCH_SHARE: Final = "0.02"

@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Callable
+from contextlib import closing
 from typing import Final
 
 from shmmap.daemon.config import DaemonConfig
@@ -38,8 +39,7 @@ from shmmap.doctor.published import (
 )
 from shmmap.doctor.verdicts import Finding, skip
 from shmmap.errors import ShmmapError
-from shmmap.segment.directory import DEFAULT_SHM_DIR
-from shmmap.segment.names import usual_directory
+from shmmap.segment.names import DEFAULT_SHM_DIR, usual_directory
 from shmmap.statistics.reader import read_statistics
 
 CHECKS: Final[dict[str, Callable[[Diagnosis], Finding]]] = {  # in the order of the output
@@ -85,7 +85,7 @@ def examine(config: DaemonConfig, file: str, machine: Machine | None = None) -> 
     except OSError as error:
         seen, unreadable = None, f"{config.shm_dir}: {error.strerror}"
     if seen is not None and seen.identity is not None:
-        with DaemonLists("shmmap doctor") as lists:
+        with closing(DaemonLists("shmmap doctor")) as lists:
             lists.add_to(seen, clients=bool(seen.identity.live))
     if seen is not None and seen.identity is not None and not (config.endpoint or config.runtime_dir):
         path = seen.identity.endpoint

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from types import TracebackType
 from typing import TYPE_CHECKING, Final
 
 from shmmap.errors import ShmmapError
@@ -32,14 +31,6 @@ class DaemonLists:
         self._name = name
         self._socket = socket
         self._client: Client | None = None
-
-    def __enter__(self) -> DaemonLists:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """End the session."""

@@ -10,14 +10,14 @@ import stat
 from collections.abc import Mapping
 from typing import Final
 
-from shmmap.daemon.config_live import SERVICE_STATE, live_directory
 from shmmap.daemon.prerequisites import account_name
 from shmmap.doctor.access import group_name, groups_of, is_in, paths_of_service
 from shmmap.doctor.diagnosis import Diagnosis
 from shmmap.doctor.verdicts import Finding, fail, ok, skip, warn
 from shmmap.errors import ConfigError
+from shmmap.live_settings import SERVICE_STATE, live_directory
 from shmmap.quantities import counted, format_bytes
-from shmmap.segment.directory import DEFAULT_SHM_DIR
+from shmmap.segment.names import DEFAULT_SHM_DIR
 
 NAMED: Final = 3
 """Problems and readers that are listed, at most."""

@@ -19,21 +19,6 @@ from numpy.typing import NDArray
 from shmmap.errors import BadRequest
 from shmmap.segment.layout import Lattice
 
-__all__ = [
-    "BUILT_ANYWHERE",
-    "OTHER_FIELDS",
-    "Box",
-    "Columns",
-    "Lattice",
-    "LayerColumn",
-    "LayerKind",
-    "LayerTable",
-    "Parameter",
-    "Parameters",
-    "PointTable",
-    "Value",
-]
-
 Value: TypeAlias = float | int
 Parameters: TypeAlias = Mapping[str, Value]
 Columns: TypeAlias = "dict[str, NDArray[Any]]"

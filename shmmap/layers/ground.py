@@ -42,7 +42,6 @@ from numpy.typing import DTypeLike, NDArray
 
 from shmmap.errors import BadRequest, MapDataError
 from shmmap.layers.contract import (
-    Lattice,
     LayerColumn,
     LayerKind,
     LayerTable,
@@ -50,6 +49,7 @@ from shmmap.layers.contract import (
     PointTable,
 )
 from shmmap.layers.voxels import edge, group_points
+from shmmap.segment.layout import Lattice
 
 GroundRule = Literal["median", "min"]
 

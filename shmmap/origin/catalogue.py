@@ -53,6 +53,8 @@ class CatalogueChange:
     """Cells in both with different stamps, so with different versions."""
     moved: Indices
     """Cells in both with different boxes (the metadata was edited), so with different versions."""
+    same_numbers: bool
+    """Whether an index names the same cell in both catalogues."""
     known: bool = True
     """True if these are all differences: both catalogues were known wherever they differ."""
 
@@ -65,9 +67,9 @@ class CatalogueChange:
         return len(self.added) + len(self.removed) + len(self.changed) + len(self.moved)
 
     @property
-    def same_cells(self) -> bool:
-        """Whether an index names the same cell in both catalogues."""
-        return self.known and not len(self.added) and not len(self.removed)
+    def touched(self) -> Indices:
+        """Cells in both whose versions differ."""
+        return np.concatenate((self.changed, self.moved))
 
     def ids(self, how: str, most: int | None = None) -> tuple[str, ...]:
         """Return ids of cells, at most ``most``; ``how`` is added, removed, changed or moved."""
@@ -356,13 +358,15 @@ def compare(old: Catalogue, new: Catalogue) -> CatalogueChange:
         kept[in_old] = True
         changed.append(in_new[(old.stamps[in_old] != new.stamps[in_new]).any(axis=1)])
         moved.append(in_new[(old.boxes[in_old] != new.boxes[in_new]).any(axis=1)])
+    came, removed = np.concatenate(added), np.flatnonzero(~kept)
     return CatalogueChange(
         old,
         new,
-        added=np.concatenate(added),
-        removed=np.flatnonzero(~kept),
+        added=came,
+        removed=removed,
         changed=np.concatenate(changed),
         moved=np.concatenate(moved),
+        same_numbers=not len(came) and not len(removed),
     )
 
 

@@ -11,35 +11,7 @@ from typing import Annotated, Final, TypeAlias
 import msgspec
 
 from shmmap.protocol.areas import LiveArea, Message
-from shmmap.protocol.rows import LiveMapRow
-
-__all__ = [
-    "LIVE_REQUESTS",
-    "MAX_CHUNK_ROWS",
-    "MAX_LACKING",
-    "MAX_NAME_BYTES",
-    "LackingChunk",
-    "LiveApplied",
-    "LiveChunkPage",
-    "LiveChunkRow",
-    "LiveChunks",
-    "LiveDurable",
-    "LiveList",
-    "LiveListed",
-    "LiveMapRow",
-    "LiveMove",
-    "LiveMoved",
-    "LiveOpen",
-    "LiveOpened",
-    "LiveRelease",
-    "LiveReleased",
-    "LiveReply",
-    "LiveRequest",
-    "LiveSave",
-    "LiveScan",
-    "LiveVoxels",
-    "LiveVoxelsReply",
-]
+from shmmap.protocol.rows import LiveMapRow as LiveMapRow
 
 MAX_NAME_BYTES: Final = 64
 MAX_CHUNK_ROWS: Final = 1000

@@ -28,7 +28,6 @@ import posix_ipc
 from shmmap.errors import SegmentCorrupt, SegmentError, StaleHandle
 from shmmap.failpoints import step
 from shmmap.lazy_imports import needed_packages
-from shmmap.segment.directory import DEFAULT_SHM_DIR
 from shmmap.segment.header import (
     OUTSIDE,
     OUTSIDE_AT,
@@ -39,7 +38,7 @@ from shmmap.segment.header import (
     unpack_publish_block,
 )
 from shmmap.segment.layout import PAGE_BYTES, ColumnRow, SegmentHeader
-from shmmap.segment.names import retired_name
+from shmmap.segment.names import DEFAULT_SHM_DIR, retired_name
 from shmmap.segment.pins import lock_slot
 from shmmap.segment.process_limits import no_files_left, no_memory_left
 

@@ -18,8 +18,6 @@ from shmmap.failpoints import step
 from shmmap.segment.header import PublishBlock, pack_publish_block
 from shmmap.segment.names import DEFAULT_SHM_DIR
 
-__all__ = ["DEFAULT_SHM_DIR", "ShmDirectory", "measured_bytes"]
-
 
 def measured_bytes(fd: int) -> int:
     """Return the bytes of memory that a file really occupies (``st_blocks`` counts 512-byte units)."""

@@ -9,8 +9,8 @@ from __future__ import annotations
 import os
 import stat
 import time
+from contextlib import closing
 from functools import cached_property
-from types import TracebackType
 from typing import TYPE_CHECKING, Literal
 
 from shmmap.errors import NotPermitted, SegmentCorrupt
@@ -128,14 +128,6 @@ class StatisticsReader:
         self._identity: DaemonIdentity | None = None
         self._process: WriterProcess | None = None
 
-    def __enter__(self) -> StatisticsReader:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
     def close(self) -> None:
         """Close the descriptors."""
         if self._process is not None:
@@ -219,7 +211,7 @@ def read_statistics(instance: str = "default", shm_dir: str = DEFAULT_SHM_DIR) -
     SegmentCorrupt
         The segment is damaged or of another major layout version.
     """
-    with StatisticsReader(instance, shm_dir) as reader:
+    with closing(StatisticsReader(instance, shm_dir)) as reader:
         return reader.snapshot()
 
 

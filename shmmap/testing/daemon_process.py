@@ -33,7 +33,7 @@ from typing import IO, Any, Final, TypeVar
 
 from shmmap.errors import InternalError
 from shmmap.processes.interrupts import interrupts_later
-from shmmap.segment.directory import DEFAULT_SHM_DIR
+from shmmap.segment.names import DEFAULT_SHM_DIR
 
 __all__ = [
     "READY_S",

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from shmmap.client.cell import Cell
     from shmmap.client.client import Client
     from shmmap.client.map_listing import MapListing
-    from shmmap.daemon.live.disk.stored_map import StoredMap
     from shmmap.errors import CellError
+    from shmmap.live_worker.disk.stored_map import StoredMap
     from shmmap.origin.remote.map_versions import Current
     from shmmap.origin.remote.store import Store
 
@@ -355,16 +355,16 @@ def open_files(paths: Sequence[str]) -> Iterator[PointSource]:
     MapDataError
         A file is damaged, or of an unknown format.
     """
-    from shmmap.daemon.live.disk.map_record import MAP_FILE
-    from shmmap.daemon.live.disk.schema import DATABASE
-    from shmmap.daemon.live.disk.stored_map import StoredMap, opened_folder_to_read
     from shmmap.dividing.inputs import find_inputs
+    from shmmap.live_worker.disk.map_record import MAP_FILE
+    from shmmap.live_worker.disk.schema import DATABASE
+    from shmmap.live_worker.disk.stored_map import opened_map
     from shmmap.origin.map_directory import open_map
 
     first = paths[0]
     if len(paths) == 1 and os.path.isdir(first):
         if any(os.path.isfile(os.path.join(first, name)) for name in (DATABASE, MAP_FILE)):
-            with opened_folder_to_read(os.path.abspath(first)) as folder, StoredMap(folder, first) as stored:
+            with opened_map(first) as stored:
                 yield _LiveFiles(stored)
             return
         if _has_metadata(first):

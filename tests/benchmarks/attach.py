@@ -20,8 +20,9 @@ import posix_ipc
 from shmmap.client.attaching import Attacher
 from shmmap.client.cell import Access, Cell
 from shmmap.protocol.messages import Handle
-from shmmap.segment.directory import DEFAULT_SHM_DIR, ShmDirectory
+from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.header import PublishBlock
+from shmmap.segment.names import DEFAULT_SHM_DIR
 from tests.support.segments import publish_segment
 
 

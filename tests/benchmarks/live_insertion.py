@@ -36,7 +36,7 @@ from shmmap.chunks.marking import Marker
 from shmmap.chunks.marks import decode_marks, encode_marks
 from shmmap.chunks.occupancy import Occupancy, ScanFilter
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.chunk_memory import ChunkFile, ChunkMemory, live_prefix
+from shmmap.live_worker.chunk_memory import ChunkFile, ChunkMemory, live_prefix
 from tests.benchmarks.street_data import data_dir, street
 from tests.support.daemon_process import LineProcess
 

@@ -32,11 +32,11 @@ import shmmap
 from shmmap.chunks.chunk_file import encode_chunk
 from shmmap.chunks.layout import ChunkView, new_header
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.chunk_memory import memory_bytes
-from shmmap.daemon.live.disk.folder import Folder
-from shmmap.daemon.live.disk.map_files import MapFiles
-from shmmap.daemon.live.disk.map_record import MapSettings
 from shmmap.formats.durable_file import flush_directory
+from shmmap.live_worker.chunk_memory import memory_bytes
+from shmmap.live_worker.disk.folder import Folder
+from shmmap.live_worker.disk.map_database import MapDatabase
+from shmmap.live_worker.disk.map_record import MapSettings
 from tests.support.live_bench import (
     FILTER,
     MAP,
@@ -68,7 +68,7 @@ def order(scans: list[Scan], count: int, stay: int) -> list[Scan]:
 
 def durable_s(folder: Path) -> tuple[float, float]:
     """Median seconds until 300 saved chunks are durable: as files, each with a name, and in the database."""
-    with closing(Folder(folder / "saved")) as opened, closing(MapFiles(opened, MapSettings())) as saved:
+    with closing(Folder(folder / "saved")) as opened, closing(MapDatabase(opened, MapSettings())) as saved:
         key = ChunkKey(0, 0, 0)
         view = ChunkView(new_header(saved.settings.identity(saved.map_id, key, 1)))
         data = encode_chunk(view, "raw") + bytes(4 << 10)

@@ -380,14 +380,14 @@ def reading_disk(orders: Orders, endpoint: str, readers: int) -> int:
 
 SLOW_DISK = """
 import os, sys, time
-if any("live.worker" in word for word in sys.orig_argv):
-    from shmmap.daemon.live.disk import map_files
-    load = map_files.MapFiles.load
+if any("live_worker" in word for word in sys.orig_argv):
+    from shmmap.live_worker.disk import map_database
+    load = map_database.MapDatabase.load
     def slow(self, key, generation=0):
         if os.path.exists(__file__ + ".slow"):
             time.sleep(2.0)
         return load(self, key, generation)
-    map_files.MapFiles.load = slow
+    map_database.MapDatabase.load = slow
 """
 """``sitecustomize`` of the live worker: reading a chunk takes two seconds while there is a certain file."""
 

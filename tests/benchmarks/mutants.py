@@ -50,7 +50,7 @@ PACKAGES: Final = (
     "shmmap/daemon/cache",
     "shmmap/daemon/loading",
     "shmmap/daemon/requests",
-    "shmmap/daemon/live",
+    "shmmap/live_worker",
     "shmmap/client",
     "shmmap/segment",
     "shmmap/origin",

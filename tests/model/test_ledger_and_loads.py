@@ -25,9 +25,9 @@ from shmmap.daemon.cache.eviction_plan import HAND_OUT_GRACE_S
 from shmmap.daemon.cache.evictor import Evictor, Freeing
 from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.cache.reclaimer import Reclaimer
-from shmmap.daemon.loading.loads import Loads
+from shmmap.daemon.loading.loads import Attempt, Load, Loads
 from shmmap.daemon.pins.watch import PinWatch
-from shmmap.daemon.records import Failure, Key, Load, Resident
+from shmmap.daemon.records import Failure, Key, Resident
 from shmmap.daemon.transport.sessions import Session, Sessions
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import lock_slot, prepare_process
@@ -143,7 +143,7 @@ class Machine(RuleBasedStateMachine):
     @rule()
     def start_next(self) -> None:
         queued = [w for w in self.loads.values() if not w.running]
-        load = self.queue.next_queued()
+        load = self.queue.choose()
         if not queued:
             assert load is None
             return
@@ -154,9 +154,9 @@ class Machine(RuleBasedStateMachine):
         shortage = used + load.estimate // PAGE - BUDGET_PAGES
         assert self.ledger.shortage(load.estimate) == shortage * PAGE
         if shortage > 0:
-            assert not self.queue.start(load, self.now_s), "a load started that does not fit"
+            assert not self.queue.start(load, Attempt(self.now_s)), "a load started that does not fit"
             return
-        assert self.queue.start(load, self.now_s)
+        assert self.queue.start(load, Attempt(self.now_s))
         nearest.running, nearest.reserved = True, load.estimate
 
     def running(self, draw: int) -> Wanted | None:

@@ -17,9 +17,9 @@ import pytest
 from shmmap.chunks.chunk_file import encode_chunk
 from shmmap.chunks.layout import ChunkView, new_header
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.disk.folder import Folder
-from shmmap.daemon.live.disk.map_files import MapFiles
-from shmmap.daemon.live.disk.map_record import MapSettings
+from shmmap.live_worker.disk.folder import Folder
+from shmmap.live_worker.disk.map_database import MapDatabase
+from shmmap.live_worker.disk.map_record import MapSettings
 
 SETTINGS = MapSettings(resolution=0.1)
 PAGE = 4096
@@ -32,11 +32,11 @@ class Disk:
     def __init__(self, directory: Path, rng: random.Random) -> None:
         self.directory, self.rng = directory, rng
         self.folder = Folder(directory)
-        self.files = MapFiles(self.folder, SETTINGS)
+        self.database = MapDatabase(self.folder, SETTINGS)
         self.now: dict[ChunkKey, int] = {}
         self.durable: dict[ChunkKey, int] = {}
         self.flushed = self.cuts = 0
-        self.files.finish()
+        self.database.finish()
         self.base = self.read("map.db")
 
     def read(self, name: str) -> bytes:
@@ -45,20 +45,20 @@ class Disk:
     def save(self) -> None:
         key = self.rng.choice(KEYS)
         version = self.now.get(key, 0) + 1
-        view = ChunkView(new_header(SETTINGS.identity(self.files.map_id, key, 1)))
+        view = ChunkView(new_header(SETTINGS.identity(self.database.map_id, key, 1)))
         view.state["version"] = version
-        self.files.save(key, encode_chunk(view, "raw"))
+        self.database.save(key, encode_chunk(view, "raw"))
         self.now[key] = version
 
     def flush(self) -> None:
-        self.files.flush()
+        self.database.flush()
         self.flushed, self.durable = len(self.read("map.db-wal")), dict(self.now)
 
     def bring_in(self) -> None:
         """Bring the log into the database; the power may fail with any part of that done."""
         self.flush()
         log = self.read("map.db-wal")
-        self.files.finish()
+        self.database.finish()
         whole = self.read("map.db")
         for _ in range(3):
             half = bytearray(self.base.ljust(len(whole), b"\0"))
@@ -92,15 +92,15 @@ class Disk:
         (found / "map.db").write_bytes(database)
         (found / "map.db-wal").write_bytes(log)
         (found / "map.json").write_bytes(self.read("map.json"))
-        with closing(Folder(found)) as folder, closing(MapFiles(folder, SETTINGS)) as files:
-            assert (files.lost, files.damaged) == ({}, {})
-            assert files.map_id == self.files.map_id
+        with closing(Folder(found)) as folder, closing(MapDatabase(folder, SETTINGS)) as again:
+            assert (again.lost, again.damaged) == ({}, {})
+            assert again.map_id == self.database.map_id
             for key, version in self.durable.items():
-                assert files.version(key) >= version
-                data = files.load(key)
+                assert again.version(key) >= version
+                data = again.load(key)
                 assert data is not None
-                assert ChunkView(data).state["version"] == files.version(key)
-            files.begin_run()
+                assert ChunkView(data).state["version"] == again.version(key)
+            again.begin_run()
         with closing(sqlite3.connect(found / "map.db")) as tables:
             assert tables.execute("pragma integrity_check").fetchone() == ("ok",)
 
@@ -109,7 +109,7 @@ class Disk:
 def test_a_power_cut_at_any_time_loses_nothing_durable(tmp_path: Path, seed: int) -> None:
     rng = random.Random(seed)
     disk = Disk(tmp_path / "map", rng)
-    disk.files.begin_run()
+    disk.database.begin_run()
     disk.flush()
     for _ in range(12):
         for _ in range(rng.randrange(1, 12)):
@@ -122,5 +122,5 @@ def test_a_power_cut_at_any_time_loses_nothing_durable(tmp_path: Path, seed: int
         if rng.random() < 0.25:
             disk.bring_in()
     assert disk.cuts > 12
-    disk.files.close()
+    disk.database.close()
     disk.folder.close()

@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.paging.durability import Chunk, Scan, State
-from shmmap.daemon.live.paging.key_index import EVERYWHERE
-from shmmap.daemon.live.paging.residency import RETRY_S, Limits, Residency
+from shmmap.live_worker.paging.durability import Chunk, Scan, State
+from shmmap.live_worker.paging.key_index import EVERYWHERE
+from shmmap.live_worker.paging.residency import RETRY_S, Limits, Residency
 
 NEW = 10
 MOST = 60
@@ -111,7 +111,7 @@ class LiveMap(RuleBasedStateMachine):
 
     @rule()
     def begin_load(self) -> None:
-        chunk = self.map.next_load(self.now_s)
+        chunk = self.map.begin_load(self.now_s)
         if chunk is not None:
             assert chunk.key not in self.memory
             self.loads.append(chunk)
@@ -146,7 +146,7 @@ class LiveMap(RuleBasedStateMachine):
 
     @rule(everything=st.booleans())
     def begin_save(self, *, everything: bool) -> None:
-        chunk = self.map.next_save(self.now_s, everything=everything)
+        chunk = self.map.begin_save(self.now_s, everything=everything)
         if chunk is not None:
             assert chunk.key not in [other.key for other, _ in self.saves], "one save of a chunk at a time"
             self.saves.append((chunk, self.memory[chunk.key].copy()))
@@ -182,7 +182,7 @@ class LiveMap(RuleBasedStateMachine):
 
     @rule()
     def evict(self) -> None:
-        chunk = self.map.next_eviction(self.now_s)
+        chunk = self.map.evict_next(self.now_s)
         if chunk is not None:
             content = self.memory.pop(chunk.key)
             assert content.scans == self.disk.get(chunk.key, Content()).scans, (
@@ -257,7 +257,7 @@ class LiveMap(RuleBasedStateMachine):
             if self.loads:
                 self._end_load(self.loads.pop(), fails=False)
             self.apply(100, 7)
-            chunk = self.map.next_save(self.now_s, everything=True)
+            chunk = self.map.begin_save(self.now_s, everything=True)
             if chunk is not None:
                 self.saves.append((chunk, self.memory[chunk.key].copy()))
             if self.saves:

@@ -8,6 +8,7 @@ import os
 import re
 import signal
 import threading
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -362,7 +363,7 @@ def test_a_daemon_whose_kernels_are_compiled_is_starting(live_daemon: LiveDaemon
     beats: set[int] = set()
     waiting = Deadline()
     while waiting(len(beats) < 3):
-        with StatisticsReader(one.instance, one.shm_dir) as statistics:
+        with closing(StatisticsReader(one.instance, one.shm_dir)) as statistics:
             seen = statistics.snapshot()
         assert seen.state in ("absent", "starting")
         beats |= {seen.beat_monotonic_ns} - {0}

@@ -39,7 +39,7 @@ DEADLINE_S = 60.0
 def after(shmmap: Shmmap, wanted: Callable[[dict[str, int]], bool]) -> dict[str, int]:
     """Wait until the counters are as wanted; returns them."""
     waiting = Deadline()
-    with StatisticsReader(shmmap.daemon.instance, shmmap.daemon.shm_dir) as reader:
+    with contextlib.closing(StatisticsReader(shmmap.daemon.instance, shmmap.daemon.shm_dir)) as reader:
         while waiting(not wanted(reader.snapshot().counters)):
             pass
         return reader.snapshot().counters

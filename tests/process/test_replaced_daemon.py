@@ -54,7 +54,7 @@ def another_version(package: Path) -> None:
     shutil.copytree(package.with_name("old"), package)
     for name, before, after in (
         ("version.py", f'"{shmmap.__version__}"', '"99.0.0"'),
-        ("daemon/live/messages.py", 'tag="begun"', 'tag="begun of another version"'),
+        ("live_messages.py", 'tag="begun"', 'tag="begun of another version"'),
     ):
         file = package / name
         text = file.read_text()
@@ -144,7 +144,7 @@ def test_a_service_ends_and_leaves_its_memory_to_the_new_version(
     assert one.process.wait(60) == Replaced.exit_code, one.log
     assert {cell.segment for cell in held} <= {f"/{name}" for name in one.segments()}
     one.killed = True
-    for name in ("daemon/live/messages.py",):  # what made it another version, but for its number
+    for name in ("live_messages.py",):  # what made it another version, but for its number
         shutil.copy(package.with_name("old") / name, package / name)
     one.start()
     until_live(one, 2)

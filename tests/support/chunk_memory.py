@@ -21,7 +21,7 @@ from shmmap.chunks.layout import ChunkIdentity, ChunkView, check_consistent, chu
 from shmmap.chunks.marks import Marks
 from shmmap.chunks.occupancy import Occupancy
 from shmmap.chunks.voxels import ChunkKey, voxels_of
-from shmmap.daemon.live.chunk_memory import map_chunk, view_at
+from shmmap.live_worker.chunk_memory import map_chunk, view_at
 
 MAP_ID = bytes(range(16))
 

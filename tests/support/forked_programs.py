@@ -36,7 +36,7 @@ ROOT: Final = Path(__file__).resolve().parents[2]
 _AT_START: Final = ("PYTHON", "LD_", "LC_", "LANG", "NUMBA_")
 _PACKAGES: Final = (
     "shmmap.cli.verbs",
-    "shmmap.daemon.live",
+    "shmmap.live_worker",
     "shmmap.publishing",
     "shmmap.origin.remote",
     "shmmap_clients.compare_map_filter",

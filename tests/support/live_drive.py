@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from shmmap.chunks.marking import Marker
 from shmmap.chunks.marks import Marks
 from shmmap.chunks.occupancy import ScanFilter
-from shmmap.daemon.live.disk.map_record import MapSettings
+from shmmap.live_worker.disk.map_record import MapSettings
 
 RESOLUTION = 0.2
 SETTINGS = MapSettings(resolution=RESOLUTION)

@@ -16,10 +16,11 @@ import shmmap
 from shmmap.chunks.chunk_file import encode_chunk, read_file_header
 from shmmap.chunks.marking import Marker
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.client.live.live_map import ChunkInfo, LiveMap
-from shmmap.daemon.live.disk.folder import Folder
-from shmmap.daemon.live.disk.map_files import MapFiles
-from shmmap.daemon.live.disk.map_record import MapSettings, Row
+from shmmap.client.live.chunk_reader import ChunkInfo
+from shmmap.client.live.live_map import LiveMap
+from shmmap.live_worker.disk.folder import Folder
+from shmmap.live_worker.disk.map_database import MapDatabase
+from shmmap.live_worker.disk.map_record import MapSettings, Row
 from tests.support.chunk_memory import ChunkMemory
 from tests.support.daemon_process import DaemonProcess
 from tests.support.live_drive import FILTER, RESOLUTION, SETTINGS, SlowOccupancy, Voxel, drive
@@ -77,11 +78,11 @@ def stored_drive(
     codec: str = "zlib",
 ) -> dict[Voxel, int]:
     """Map a drive, moved by metres, and save it; returns all voxels known."""
-    with closing(Folder(directory)) as folder, closing(MapFiles(folder, settings)) as files:
-        memory = _driven(scans, shift, settings, files.map_id)
+    with closing(Folder(directory)) as folder, closing(MapDatabase(folder, settings)) as database:
+        memory = _driven(scans, shift, settings, database.map_id)
         for key, view in memory.chunks.items():
-            files.save(key, encode_chunk(view, codec))
-        files.write_record()
+            database.save(key, encode_chunk(view, codec))
+        database.write_record()
     return memory.voxels()
 
 
@@ -140,5 +141,5 @@ LiveDaemon = Callable[..., DaemonProcess]
 
 def worker_of(one: DaemonProcess) -> int:
     """Id of the live worker."""
-    (found,) = (pid for pid in one.children() if b"live.worker" in Path(f"/proc/{pid}/cmdline").read_bytes())
+    (found,) = (pid for pid in one.children() if b"live_worker" in Path(f"/proc/{pid}/cmdline").read_bytes())
     return found

@@ -10,14 +10,14 @@ from typing import Any
 
 from shmmap.chunks.marks import Marks, encode_marks
 from shmmap.chunks.voxels import voxels_of
-from shmmap.daemon.config_live import LiveSettings
-from shmmap.daemon.live.chunk_memory import ChunkMemory, live_prefix
-from shmmap.daemon.live.disk.folder import Folder
-from shmmap.daemon.live.disk.map_files import MapFiles
-from shmmap.daemon.live.messages import Ask
-from shmmap.daemon.live.paging.residency import Limits
-from shmmap.daemon.live.worker.marks_directory import MarksDirectory
-from shmmap.daemon.live.worker.served_map import ServedMap
+from shmmap.live_messages import Ask
+from shmmap.live_settings import LiveSettings
+from shmmap.live_worker.chunk_memory import ChunkMemory, live_prefix
+from shmmap.live_worker.disk.folder import Folder
+from shmmap.live_worker.disk.map_database import MapDatabase
+from shmmap.live_worker.marks_directory import MarksDirectory
+from shmmap.live_worker.paging.residency import Limits
+from shmmap.live_worker.served_map import ServedMap
 from shmmap.protocol import live as messages
 from tests.support.daemon_process import Deadline
 from tests.support.live_drive import RESOLUTION, SETTINGS, Voxel
@@ -45,15 +45,16 @@ class Served:
         self._folder = Folder(disk)
         self.marks = MarksDirectory(str(shm / "marks"))
         settings = LiveSettings("lidar", str(disk), resolution=RESOLUTION)
-        files, memory = MapFiles(self._folder, SETTINGS), ChunkMemory(str(shm), live_prefix("test", "lidar"))
+        database = MapDatabase(self._folder, SETTINGS)
+        memory = ChunkMemory(str(shm), live_prefix("test", "lidar"))
         self.map = ServedMap(
-            settings, files, memory, Limits(budget_bytes, **limits), self.marks, self._answer
+            settings, database, memory, Limits(budget_bytes, **limits), self.marks, self._answer
         )
-        self.live = self.map.live
+        self.paged = self.map.paged
         try:
             self.map.adopt(0.0)
         except OSError:
-            self.live.close()
+            self.paged.close()
             self._folder.close()
             raise
 
@@ -76,7 +77,7 @@ class Served:
 
     def send(self, marks: Marks, mapper: int, scan: int, session: int = 1, at: float = 0.0) -> int:
         """Send a scan; returns its ticket."""
-        data = encode_marks(marks, self.live.files.map_id, mapper, scan)
+        data = encode_marks(marks, self.paged.database.map_id, mapper, scan)
         name = f"{session:x}.{self._files}"
         Path(self.marks.path, name).write_bytes(data)
         return self.ask(
@@ -93,7 +94,7 @@ class Served:
         waiting = Deadline()
         while waiting(not done()):
             self.turn(save_all=save_all)
-            self.live.wait(0.01)
+            self.paged.wait(0.01)
 
     def answer(self, ticket: int, *, save_all: bool = False) -> Any:
         """Turn until a request is answered."""
@@ -109,13 +110,13 @@ class Served:
             self.until(lambda: self.map.is_saved, save_all=True)
         self.map.end(keep=keep)
         self.marks.close()
-        self.live.memory.close()
+        self.paged.memory.close()
         self._folder.close()
 
     def voxels(self) -> dict[Voxel, int]:
         """All known voxels in memory."""
         found: dict[Voxel, int] = {}
-        for key, chunk in self.live.chunks.items():
+        for key, chunk in self.paged.chunks.items():
             dense = chunk.view.dense()
             places = dense.nonzero()[0]
             for voxel, value in zip(voxels_of(key, places).tolist(), dense[places].tolist(), strict=True):

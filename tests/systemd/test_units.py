@@ -13,8 +13,7 @@ from pathlib import Path
 import pytest
 
 from shmmap.daemon.config import DaemonConfig
-from shmmap.daemon.config_live import SERVICE_STATE, live_directory
-from shmmap.daemon.live.relay import END_S
+from shmmap.daemon.live_relay import END_S
 from shmmap.daemon.main import LIVE_ALONE_S
 from shmmap.errors import (
     BadRequest,
@@ -25,6 +24,7 @@ from shmmap.errors import (
     MapDataError,
     MapMissing,
 )
+from shmmap.live_settings import SERVICE_STATE, live_directory
 from tests.support.daemon_process import ROOT
 
 UNITS = ROOT / "systemd"

@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from shmmap.daemon.live.disk.folder import Folder, replace_file
 from shmmap.formats.durable_file import appearing_file
+from shmmap.live_worker.disk.folder import Folder, replace_file
 
 Steps = list[tuple[str, object]]
 

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import pytest
 import shmmap_clients
+import site_contents
 
 import shmmap
 
@@ -48,6 +49,7 @@ BASE = {
     "progress",
     "work_room",
     "version",
+    "config_table",
 }
 PARTS = {
     # part: what it may import besides itself
@@ -74,11 +76,15 @@ PARTS = {
     "disk_budget": {"failpoints", "private_directory"},
     "private_directory": set[str](),
     "work_room": set[str](),
+    "config_table": {"errors"},
     "lazy_imports": {"errors", "installed", "segment.process_limits"},
     "aio": {"client"},
     "live": {"chunks", "client", "lazy_imports", "protocol"},
     "events": {"client", "lazy_imports", "protocol"},
     "chunks": {"errors", "failpoints", "compiling", "lazy_imports"},
+    "live_settings": {"errors", "chunks", "config_table"},
+    "live_messages": {"live_settings", "protocol"},
+    "live_worker": BASE | {"chunks", "dividing", "formats", "live_messages", "live_settings", "protocol"},
     "statistics": {"errors", "columns", "geometry", "logfmt", "protocol", "large_tables", "segment"},
     "layers": BASE | {"formats", "segment", "protocol", "statistics"},
     "origin": BASE | {"formats", "segment", "protocol", "statistics"},
@@ -89,15 +95,16 @@ PARTS = {
         "formats.png", "viewing.rendering",  # what notebooks show
     },
     "daemon": BASE | {
-        "chunks", "formats", "segment", "protocol", "statistics", "layers", "origin", "dividing",
+        "formats", "segment", "protocol", "statistics", "layers", "origin", "dividing", "live_messages",
+        "live_settings",
     },
     "prepare": BASE | {"formats", "layers", "origin", "segment"},
     "publishing": BASE | {"dividing", "formats", "layers", "origin", "prepare", "segment"},
     "service": BASE | {"origin", "daemon.config"},
     "doctor": BASE | {
-        "client", "formats", "origin", "protocol", "segment", "service", "statistics",
-        "daemon.config", "daemon.config_live", "daemon.prerequisites",
-        "daemon.pins.probe", "daemon.service_manager", "daemon.host.memory",
+        "client", "formats", "live_settings", "origin", "protocol", "segment", "service", "statistics",
+        "daemon.config", "daemon.prerequisites", "daemon.pins.probe", "daemon.service_manager",
+        "daemon.host.memory",
     },
     "simulation": BASE | {"dividing", "formats", "origin"},
     "testing": BASE | {"formats", "layers", "origin", "segment", "protocol", "client", "statistics"},
@@ -105,20 +112,18 @@ PARTS = {
         "dividing", "formats", "origin", "layers", "segment", "protocol", "client", "statistics",
         "simulation", "testing", "viewing",
     },
-    "viewing": BASE | {"chunks", "client", "daemon.live.disk", "dividing", "formats", "origin", "protocol"},
+    "viewing": BASE | {"chunks", "client", "dividing", "formats", "live_worker.disk", "origin", "protocol"},
     "cli": BASE | {
-        "client", "demo", "dividing", "doctor", "formats", "layers", "origin", "prepare", "protocol",
-        "publishing", "segment", "service", "statistics", "viewing", "daemon.config",
-        "daemon.config_live", "daemon.config_table", "daemon.live.disk",
-        "daemon.main", "daemon.prerequisites", "daemon.pins.probe", "daemon.service_manager",
+        "client", "demo", "dividing", "doctor", "formats", "layers", "live_settings", "live_worker.disk",
+        "origin", "prepare", "protocol", "publishing", "segment", "service", "statistics", "viewing",
+        "daemon.config", "daemon.main", "daemon.prerequisites", "daemon.pins.probe", "daemon.service_manager",
     },
 }  # fmt: skip
 """What stands below what; a dotted name allows that module or package alone."""
 ROOMS = [
     {"__main__"}, {"main"}, {"assembly"}, {"map_in_memory", "serving_loop"}, {"requests"},
-    {"telemetry"}, {"loading", "live"}, {"cache"}, {"events"}, {"transport"}, {"travel", "prerequisites"},
-    {"map", "pins"}, {"host", "service_manager"}, {"config"}, {"config_live"},
-    {"config_table", "records", "turns"},
+    {"telemetry"}, {"loading", "live_relay"}, {"cache"}, {"events"}, {"transport"},
+    {"travel", "prerequisites"}, {"map", "pins"}, {"host", "service_manager"}, {"config", "records", "turns"},
 ]  # fmt: skip
 """The daemon's floors, uppermost first; a room imports from the floors below its own."""
 
@@ -281,6 +286,17 @@ def modules_with_a_list() -> list[str]:
         for module in (*modules(), *modules(CLIENTS))
         if re.search("^__all__ = ", source(module).read_text(encoding="utf-8"), re.MULTILINE)
     ]
+
+
+def test_lists_are_of_public_modules_and_of_names_from_others() -> None:
+    """Nothing else needs one, since nothing is imported with ``*``."""
+    for module in set(modules_with_a_list()) - {page.module for page in site_contents.API}:
+        names = set(importlib.import_module(module).__all__)
+        nodes = ast.walk(parsed(source(module)))
+        imported_names = {
+            alias.name for node in nodes if isinstance(node, ast.ImportFrom) for alias in node.names
+        }
+        assert names & imported_names, f"{module} needs no __all__"
 
 
 @pytest.mark.parametrize("module", modules_with_a_list())

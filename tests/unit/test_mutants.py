@@ -70,7 +70,7 @@ def test_the_same_seed_draws_the_same_ones_spread_over_packages() -> None:
         "shmmap/daemon/cache": 4,
         "shmmap/daemon/loading": 4,
         "shmmap/daemon/requests": 4,
-        "shmmap/daemon/live": 4,
+        "shmmap/live_worker": 4,
         "shmmap/client": 4,
         "shmmap/segment": 4,
         "shmmap/origin": 4,

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from shmmap.chunks.occupancy import ScanFilter
     from shmmap.client.live.mapper import LiveMapper
 
-__all__ = ["ChunkInfo", "LiveMap", "Sphere", "Voxels"]
-
 R = TypeVar("R")
 
 LIST_S: Final = 60.0

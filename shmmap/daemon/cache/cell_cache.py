@@ -12,7 +12,6 @@ from collections.abc import Iterable, Sequence
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shmmap.daemon.cache.evictor import Evictor
 from shmmap.daemon.cache.holders import Holders, Survey
@@ -33,6 +32,7 @@ from shmmap.layers.points import LAYER
 from shmmap.layers.spec import layer_spec
 from shmmap.layers.versions import LayerVersions
 from shmmap.logfmt import log
+from shmmap.origin.catalogue import CatalogueChange
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.header import PublishBlock
 from shmmap.segment.names import new_segment_name, segment_prefix
@@ -266,29 +266,33 @@ class CellCache:
         self.heights.learn(index, resident.z_min, resident.z_max)
         return True
 
-    def serve(self, new: CatalogueView, changed: NDArray[np.intp] | None) -> list[ShardedDict[int, Any]]:
-        """Serve another state of the map.
+    def serve(self, new: CatalogueView, change: CatalogueChange) -> list[ShardedDict[int, Any]]:
+        """Serve another state of the map, of which any number of cells may have changed.
 
         No cell is warm in the new state until `find_warm` or `MapSwitch.run_step` has found it in the ledger.
-
-        Parameters
-        ----------
-        changed
-            Indices of changed cells; None if the new catalogue numbers cells differently.
-
-        Returns
-        -------
-        list
-            Unused tables, to be freed in steps: freeing many entries at once takes long.
+        Returned are the tables that are not used any more: freeing many entries at once takes long.
         """
         left: list[ShardedDict[int, Any]] = [*self.warm.layers.values(), *self.layers.forget()]
         self.catalogue = new
         self.warm = self.warm.successor()
-        if changed is None:
-            self.heights = Heights(len(new))
+        if change.same_numbers:
+            self.heights.forget(change.touched)
         else:
-            self.heights.forget(changed)
+            self.heights = Heights(len(new))
         return left
+
+    def serve_with_few_changes(self, new: CatalogueView, change: CatalogueChange) -> list[Resident]:
+        """Serve another state of the map, whose cells have the same numbers and of which few have changed.
+
+        All others stay warm.  Returned are the segments of the changed cells, for `MapSwitch.run_step`.
+        """
+        for index in change.touched.tolist():
+            self.invalidate(index)
+        self.catalogue = new
+        for index in change.moved.tolist():
+            self.invalidate(index)  # the cells around its new place
+        ids = map(new.id, change.touched.tolist())
+        return [resident for cell_id in ids for resident in self.ledger.of_cell(cell_id)]
 
     # --- being used -----------------------------------------------------------------------------
 

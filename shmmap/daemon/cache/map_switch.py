@@ -8,8 +8,6 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, Final, NamedTuple
 
-import numpy as np
-
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.records import Resident
@@ -20,6 +18,10 @@ from shmmap.segment.version import Stamp
 
 CELLS_REMEMBERED: Final = 2048
 """Changed cells remembered, over all states; for changes before these, clients read the whole list."""
+FEW: Final = 128
+FEW_AMONG_OTHERS: Final = 8
+"""Changed cells whose segments are found in one step, in about a millisecond; the second number holds if
+there are layers that read neighbouring cells: to find the neighbours takes longer."""
 
 
 class _Changed(NamedTuple):
@@ -33,8 +35,13 @@ class _Changed(NamedTuple):
 class MapSwitch:
     """Changes the catalogue that the cache serves, and remembers the changed cells.
 
-    The switch itself is one short step.  The segments in memory are then checked, some per `run_step`; a cell
-    that is requested in the meantime is checked at once (`CellCache.find_warm`).
+    The switch itself is one short step.  Segments are then checked, some per `run_step`; a cell that is
+    requested in the meantime is checked at once (`CellCache.find_warm`).  If few cells have changed, only
+    their segments are checked; if many have, or cells have new numbers, all that are in memory.
+
+    Cells are numbered anew when one is added or removed.  Fixed numbers would need a table of the order of
+    ids, and spare no mechanism: a map whose files were all rewritten, and another version of a published
+    map, need the check of all segments in any case.
     """
 
     def __init__(self, cache: CellCache) -> None:
@@ -96,16 +103,28 @@ class MapSwitch:
             self._remember(touched, change.ids("removed"))
         else:
             self._history.clear()
-        changed = np.concatenate((change.changed, change.moved))
         cache.statistics.map_changed()
-        self._leftovers += cache.serve(new, changed if change.same_cells else None)
-        self._to_free = self._to_free or Walk(self._free_leftovers())
-        self.recheck()
+        if self._is_small(change):
+            segments = cache.serve_with_few_changes(new, change)
+            self._check(segments, len(segments))
+        else:
+            self._leftovers += cache.serve(new, change)
+            self._to_free = self._to_free or Walk(self._free_leftovers())
+            self.recheck()
+
+    def _is_small(self, change: CatalogueChange) -> bool:
+        """Whether only the segments of changed cells have to be checked, and these can be found at once."""
+        if not change.same_numbers or self._unseen is not None:
+            return False
+        around = self._cache.layers.halo_m(self._cache.ledger.layers()) > 0.0
+        return change.count <= (FEW_AMONG_OTHERS if around else FEW)
 
     def recheck(self) -> None:
         """Check all segments again: more of the map is known, so more segments may be current."""
-        self._unseen = Walk(self._cache.ledger.segments.walk())
-        self._cache.unentered = self._cache.ledger.resident_count
+        self._check(self._cache.ledger.segments.walk(), self._cache.ledger.resident_count)
+
+    def _check(self, segments: Iterable[Resident], count: int) -> None:
+        self._unseen, self._cache.unentered = Walk(segments), count
 
     @property
     def busy(self) -> bool:

@@ -204,7 +204,7 @@ class Adoption:
         self.cache.adopt(resident, index)
         if outside:
             self.misplaced.note(resident.key.cell_id, index, outside)
-        self.loads.check(resident)
+        self.loads.check_leftover(resident)
 
     def _is_used(self, fd: int) -> bool:
         reclaimer = self.cache.reclaimer

@@ -9,15 +9,17 @@ Loads that no client waits for (checks of adopted segments, pinned cells) come w
 
 from __future__ import annotations
 
+import enum
 import heapq
+import math
 from collections import OrderedDict
 from collections.abc import Hashable
-from dataclasses import dataclass, field
-from typing import Final
+from dataclasses import dataclass, field, replace
+from typing import Final, TypeAlias
 
 from shmmap.daemon.cache.ledger import Ledger
-from shmmap.daemon.loading.link import Link
-from shmmap.daemon.records import SPACE_CODES, Failure, Key, Load, Resident
+from shmmap.daemon.loading.link import Cause, Link
+from shmmap.daemon.records import SPACE_CODES, Failure, Key, Resident
 from shmmap.layers.points import LAYER
 from shmmap.segment.version import Stamp
 
@@ -37,6 +39,82 @@ LOOKED_BEHIND: Final = 8
 """Loads of each kind of an asker that are examined to estimate the memory needed soon."""
 MAX_REMEMBERED: Final = 1024
 """Askers whose clocks are remembered; forgetting an idle asker cancels the debt of its finished loads."""
+
+
+class Purpose(enum.Enum):
+    """Why a segment is loaded."""
+
+    DEMAND = "a client has asked for it"
+    SPARE = "only spare requests have asked for it"
+    WISH = "no client has asked for it yet"
+
+
+@dataclass(frozen=True, slots=True)
+class LeftoverCheck:
+    """Check of a previous run's segment; its cell is loaded if that fails and a client has asked for it."""
+
+    resident: Resident
+    is_asked_for: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class FailedFileCheck:
+    """Check of a file that failed in the state ``stamp``: in another state its cell is loaded."""
+
+    stamp: Stamp
+
+
+Work: TypeAlias = Purpose | LeftoverCheck | FailedFileCheck
+"""What a worker has to do for a key: make a segment, or a check that may lead to that."""
+
+
+@dataclass(slots=True, eq=False)
+class Attempt:
+    """A worker's work at a load.
+
+    ``sources`` are the states of its file and its neighbours' files in the catalogue when the worker was
+    given the job, none for a check, and ``version`` is the version that follows from them.  In the end,
+    ``spent_s`` is the loader time that it took, and ``took_s`` the whole time, fetching included.
+    """
+
+    started_s: float
+    sources: tuple[Stamp, ...] = ()
+    version: int = 0
+    spent_s: float = 0.0
+    took_s: float = 0.0
+
+
+@dataclass(slots=True, eq=False)
+class Load:
+    """Work that is queued or that a worker does.
+
+    ``reserved`` bytes are promised to it while it runs, which is while there is an ``attempt``.  ``computed``
+    means that the layer is computed, which may take long.  ``link_bytes`` is what it fetches from a remote
+    origin.  ``losses`` counts loaders that were lost through no fault of this load.
+    """
+
+    key: Key
+    estimate: int
+    priority: float
+    number: int
+    work: Work = Purpose.DEMAND
+    asker: Hashable = None
+    computed: bool = False
+    attempt: Attempt | None = None
+    reserved: int = 0
+    link_bytes: int = 0
+    losses: int = 0
+
+    @property
+    def is_running(self) -> bool:
+        """Whether a worker has it."""
+        return self.attempt is not None
+
+    @property
+    def is_ahead(self) -> bool:
+        """Whether no client needs its segment now."""
+        return self.work is Purpose.WISH or self.work is Purpose.SPARE
+
 
 _Heap = list[tuple[float, int, Load]]
 
@@ -64,6 +142,7 @@ class LoadQueue:
         self.changes = 0
         self._loads: dict[int, Load] = {}
         self._askers: dict[Hashable, _Asker] = {}
+        self._charged: dict[Load, tuple[Hashable, float]] = {}  # running loads: asker, estimated seconds
         self._clock_s = 0.0
         self._chosen: Hashable = None
 
@@ -93,25 +172,26 @@ class LoadQueue:
         self.changes += 1
         self._loads.pop(load.number, None)
 
-    def started(self, load: Load) -> None:
-        """Remove a load that starts, and charge it to the asker whose turn it was; `ended` has to follow."""
+    def start(self, load: Load) -> None:
+        """Take out the load that `choose` has chosen, and charge its asker for its bytes."""
         self.discard(load)
-        load.payer, load.charged_s = self._chosen, LOAD_S + load.estimate * BYTE_S
-        chosen = self._askers.get(self._chosen)
-        if chosen is not None:
-            chosen.running += 1
-            chosen.clock_s += load.charged_s
+        estimate_s = LOAD_S + load.estimate * BYTE_S
+        self._charged[load] = self._chosen, estimate_s
+        payer = self._askers.get(self._chosen)
+        if payer is not None:
+            payer.running += 1
+            payer.clock_s += estimate_s
 
-    def ended(self, load: Load) -> None:
-        """Charge a load that has ended, or is put back, for the time it took."""
-        payer = self._askers.get(load.payer)
+    def end(self, load: Load, spent_s: float) -> None:
+        """Charge a load that no longer runs for the loader time that it took, instead of its bytes."""
+        asker, estimate_s = self._charged.pop(load)
+        payer = self._askers.get(asker)
         if payer is not None:
             payer.running -= 1
-            payer.clock_s += load.spent_s - load.charged_s
-        load.spent_s = 0.0
+            payer.clock_s += spent_s - estimate_s
 
-    def next(self, *, points: bool = True, layers: bool = True) -> Load | None:
-        """Return the next load among points, computed layers, or both; None if there is none."""
+    def choose(self, *, points: bool = True, layers: bool = True) -> Load | None:
+        """Choose the next load among points, computed layers, or both; None if there is none."""
         best: tuple[bool, float, float, int] | None = None
         found: Load | None = None
         for asker, mine in list(self._askers.items()):
@@ -129,7 +209,7 @@ class LoadQueue:
         return found
 
     def bytes_behind(self) -> int:
-        """Return the sum of the estimates of some loads that follow the one `next` has just returned."""
+        """Return the sum of the estimates of some loads that follow the one `choose` has chosen."""
         chosen = self._askers.get(self._chosen)
         if chosen is None:
             return 0
@@ -209,60 +289,76 @@ class Loads:
         Askers take turns, in `LoadQueue`.  ``computed`` means that the load may take long; by default, that
         is every layer except ``points``.
         """
-        load = self.by_key.get(key)
-        if load is None:
-            self._numbers += 1
-            computed = key.layer != LAYER if computed is None else computed
-            load = self.by_key[key] = Load(
-                key, estimate, priority, self._numbers, asker=asker, computed=computed
-            )
-        load.prefetch = load.spare = False
-        if load.running:
-            load.wanted = True
-            return load
-        load.wanted, load.priority = True, min(load.priority, priority)
-        self._queue.push(load, priority, asker)
+        load = self._queue_for(key, estimate, priority, asker, Purpose.DEMAND, computed)
+        if isinstance(load.work, LeftoverCheck):
+            load.work = replace(load.work, is_asked_for=True)
+        elif isinstance(load.work, Purpose):
+            load.work = Purpose.DEMAND
         return load
 
     def prefetch(self, key: Key, estimate: int, needed_in_s: float, *, computed: bool) -> Load:
         """Queue a load that no client has asked for yet, after all loads that clients ask for."""
-        load = self.want(key, estimate, PREFETCH + needed_in_s, PREFETCH, computed=computed)
-        load.wanted, load.prefetch = False, True
-        return load
+        return self._queue_for(key, estimate, PREFETCH + needed_in_s, PREFETCH, Purpose.WISH, computed)
 
     def spare(self, key: Key, estimate: int, asker: Hashable, *, computed: bool) -> Load:
         """Queue a load for a spare request, after all loads that clients ask for."""
-        load = self.want(key, estimate, BACKGROUND, asker, computed=computed)
-        load.spare = True
+        load = self._queue_for(key, estimate, BACKGROUND, asker, Purpose.SPARE, computed)
+        if load.work is Purpose.WISH:
+            load.work = Purpose.SPARE
+        return load
+
+    def check_leftover(self, resident: Resident) -> None:
+        """Queue the check of a previous run's segment, after all loads that clients ask for."""
+        load = self._queue_for(resident.key, 0, math.inf, None, LeftoverCheck(resident), None)
+        if isinstance(load.work, Purpose) and not load.is_running:
+            load.work, load.estimate = LeftoverCheck(resident, load.work is Purpose.DEMAND), 0
+
+    def check_failed_file(self, key: Key, priority: float, asker: Hashable, stamp: Stamp) -> Load:
+        """Queue the check of a file that failed, for a client that asks for its cell again."""
+        return self._queue_for(key, 0, priority, asker, FailedFileCheck(stamp), None)
+
+    def _queue_for(
+        self,
+        key: Key,
+        estimate: int,
+        priority: float,
+        asker: Hashable,
+        work: Work,
+        computed: bool | None,
+    ) -> Load:
+        """Return the load of a key, moved forward if it is queued; if there is none, queue this ``work``."""
+        load = self.by_key.get(key)
+        if load is None:
+            self._numbers += 1
+            computed = key.layer != LAYER if computed is None else computed
+            load = self.by_key[key] = Load(key, estimate, priority, self._numbers, work, asker, computed)
+        if not load.is_running:
+            load.priority = min(load.priority, priority)
+            self._queue.push(load, priority, asker)
         return load
 
     def is_promised(self, key: Key) -> bool:
         """Whether a load of a key is on its way, and not merely a check of the file that failed."""
         load = self.by_key.get(key)
-        return load is not None and load.unless is None
+        return load is not None and not isinstance(load.work, FailedFileCheck)
 
-    def check(self, resident: Resident) -> None:
-        """Queue the check of a previous run's segment, after all loads that clients ask for."""
-        load = self.want(resident.key, 0, float("inf"))
-        load.adopted, load.wanted = resident, False
-
-    def next_queued(self, *, points: bool = True, layers: bool = True) -> Load | None:
-        """Return the nearest load of the asker whose turn it is, of the kinds that a worker can take now."""
-        return self._queue.next(points=points, layers=layers)
+    def choose(self, *, points: bool = True, layers: bool = True) -> Load | None:
+        """Choose the nearest load of the asker whose turn it is, of the kinds that a worker can take now."""
+        return self._queue.choose(points=points, layers=layers)
 
     def bytes_behind(self) -> int:
-        """Return the bytes of some loads that follow the one `next_queued` has just returned."""
+        """Return the bytes of some loads that follow the one `choose` has chosen."""
         return self._queue.bytes_behind()
 
-    def start(self, load: Load, now_s: float) -> bool:
-        """Reserve the load's bytes and count it as running; return False if they do not fit."""
+    def start(self, load: Load, attempt: Attempt) -> bool:
+        """Reserve the bytes of the chosen load; it runs from now on.  Return False if they do not fit."""
         if not self._ledger.reserve(load.estimate):
             return False
-        self._queue.started(load)
-        load.running, load.started_s, load.reserved = True, now_s, load.estimate
+        self._queue.start(load)
+        load.attempt, load.reserved = attempt, load.estimate
         if self._link is not None and load.link_bytes:
-            ahead = load.prefetch or load.spare
-            self._link.begin(load, load.link_bytes, now_s, "ahead" if ahead else "demand")
+            cause: Cause = "ahead" if load.is_ahead else "demand"
+            self._link.begin(load, load.link_bytes, attempt.started_s, cause)
         return True
 
     def grow(self, load: Load, nbytes: int) -> bool:
@@ -284,9 +380,9 @@ class Loads:
     def _take_back(self, load: Load) -> None:
         self._ledger.reserved_bytes -= load.reserved
         load.reserved = 0
-        if load.running:
-            load.running = False
-            self._queue.ended(load)
+        if load.attempt is not None:
+            self._queue.end(load, load.attempt.spent_s)
+            load.attempt = None
             if self._link is not None:
                 self._link.end(load)
 
@@ -325,7 +421,7 @@ class Loads:
         """Drop a queued load and a remembered failure of a key (its cell left the map)."""
         self.forget_failure(key)
         load = self.by_key.get(key)
-        if load is not None and not load.running:
+        if load is not None and not load.is_running:
             self._queue.discard(load)
             del self.by_key[key]
 

@@ -8,10 +8,9 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from shmmap.daemon.host.memory import memory_limit_bytes, out_of_memory_kills
-from shmmap.daemon.loading.loads import Loads
+from shmmap.daemon.loading.loads import Load, Loads
 from shmmap.daemon.loading.room import Room
 from shmmap.daemon.loading.worker_pool import Work, Worker, WorkerPool
-from shmmap.daemon.records import Load
 from shmmap.installed import RESTART, is_replaced
 from shmmap.logfmt import log
 from shmmap.quantities import format_bytes
@@ -113,10 +112,13 @@ class LostWorkers:
                 self.loads.requeue(load)
                 continue
             log.error("loader replaced", path=job.source.name, reason=why)
-            load.spent_s = spent_s
+            sources: tuple[Stamp, ...] = ()
+            if (attempt := load.attempt) is not None:
+                attempt.spent_s = attempt.took_s = spent_s
+                sources = attempt.sources
             # after a timeout the file is not accessed again: its file system may be what hangs
             blamed = code == "load_failed" and not why.startswith(OUT_OF_MEMORY)
-            known = load.sources[0] if blamed and load.sources else None
+            known = sources[0] if blamed and sources else None
             self.fail(load, code, f"{job.source.name}: {why}", known, now_s)
 
     def _unfinished(self, worker: Worker) -> Iterator[tuple[Work, Load]]:

@@ -17,10 +17,10 @@ from typing import Final
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.evictor import Freeing
 from shmmap.daemon.loading.link import Link
-from shmmap.daemon.loading.loads import Loads
+from shmmap.daemon.loading.loads import Attempt, Load, Loads, Purpose
 from shmmap.daemon.loading.look_ahead import URGENT_S, Prefetch, Reader
 from shmmap.daemon.loading.worker_pool import WorkerPool
-from shmmap.daemon.records import Key, Load, Resident
+from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.transport.sessions import MOVES_PER_STEP, Session
 
 MAX_PATHS: Final = 256
@@ -65,7 +65,7 @@ class Prefetcher:
         self._sessions, self._ledger, self._evictor = cache.sessions, cache.ledger, cache.evictor
         self._layers, self._events, self._statistics = cache.layers, cache.events, cache.statistics
         self.cold: deque[tuple[Session, Key]] = deque(maxlen=MAX_COLD)
-        self.ended: deque[tuple[Load, bool, float, bool]] = deque(maxlen=MAX_ENDED)
+        self.ended: deque[tuple[Load, Attempt | None, bool]] = deque(maxlen=MAX_ENDED)
         self.share, self.outage_tolerance_s = share, outage_tolerance_s
         self.prefetch = Prefetch(self._is_missing, outage_tolerance_s)
         self._reader = Reader(self._is_absent)
@@ -85,9 +85,9 @@ class Prefetcher:
     def note_cold(self, session: Session, key: Key) -> None:
         """Note that a client is the first to ask for a cell that is not in memory."""
         load = self._loads.by_key.get(key)
-        if load is None or load.prefetch:
+        if load is None or load.work is Purpose.WISH:
             self.cold.append((session, key))
-            self._statistics.add("prefetch_overtaken", load is not None and load.running)
+            self._statistics.add("prefetch_overtaken", load is not None and load.is_running)
 
     def restart(self) -> None:
         """Examine all paths from the start: the map or its origin is known better now."""
@@ -217,27 +217,29 @@ class Prefetcher:
         """Note that there is no memory for a wish at present."""
         self._full_until_s = now_s + FULL_S
 
-    def note_end(self, load: Load, took_s: float, *, out: bool) -> None:
-        """Note the end of a load, the loader time it took, and whether its source was unreachable."""
-        self.ended.append((load, load.running, took_s, out))
+    def note_end(self, load: Load, *, out: bool) -> None:
+        """Note the end of a load, and whether its source was unreachable."""
+        self.ended.append((load, load.attempt, out))
 
     def started(self, load: Load) -> None:
         """Note that a loader has begun a wish."""
         self._statistics.add("prefetch_started", load not in self._running)
         self._running[load] = load.estimate
 
-    def _learn(self, load: Load, ran: bool, took_s: float, out: bool) -> None:
+    def _learn(self, load: Load, attempt: Attempt | None, out: bool) -> None:
         """Infer from the end of a load whether its origin answers.
 
         A broken file counts as an answer.  The failure of a load that began before another load succeeded
         belongs to an outage that has ended.
         """
         self._running.pop(load, None)
-        if not ran or not load.sources or (out and self._now_s - took_s < self._answered_s):
+        if attempt is None or not attempt.sources:
+            return
+        if out and self._now_s - attempt.took_s < self._answered_s:
             return
         if not out:
             self._answered_s = self._now_s
-        if self.health.ended(took_s, failed=out):
+        if self.health.ended(attempt.took_s, failed=out):
             self._loads.forget_failures()
 
     def lacks_room(self, now_s: float) -> bool:

@@ -5,17 +5,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, NamedTuple
 
 from shmmap.daemon.cache.evictor import Evictor, Freeing
 from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.cache.lost_segments import LostSegments
 from shmmap.daemon.cache.reclaimer import Reclaimer
-from shmmap.daemon.loading.loads import Loads
+from shmmap.daemon.loading.loads import Load, Loads, Purpose
 from shmmap.daemon.loading.prefetcher import Prefetcher
 from shmmap.daemon.loading.worker_messages import Decision, Need
 from shmmap.daemon.loading.worker_pool import Worker, WorkerPool
-from shmmap.daemon.records import Load, Resident
+from shmmap.daemon.records import Resident
 from shmmap.daemon.turns import WatchedDescriptors
 from shmmap.quantities import format_bytes
 
@@ -23,6 +23,12 @@ AHEAD_SHARE: Final = 32
 """Fraction of the budget (1/32) up to which memory is also freed for loads that follow the next one."""
 AGAIN_S: Final = 0.05
 """Delay after which a load that waits for memory asks again even if nothing has changed: a precaution."""
+
+
+class Refused(NamedTuple):
+    """Why a load cannot have the memory that it needs."""
+
+    why: str
 
 
 @dataclass(eq=False, slots=True)
@@ -71,25 +77,25 @@ class Room:
         self.reclaimer.release(residents, now_s)
         self.loads.forget_refusals()
 
-    def refusal(self, load: Load, shortage: int, behind: int, now_s: float) -> str:
-        """Free memory for a load; return why that is impossible, or an empty text if it is under way.
+    def refusal(self, load: Load, shortage: int, behind: int, now_s: float) -> Refused | None:
+        """Free memory for a load; return None if it is under way, or why that is impossible.
 
         Evicted memory is free a moment later.  At the same time more is evicted, for the loads of ``behind``
         bytes that come next: else each of them would have to wait for its own eviction.
         """
         ledger = self.ledger
-        if load.prefetch:
+        if load.work is Purpose.WISH:
             has_room = self.prefetcher.make_room(load, shortage, now_s)
-            return "" if has_room else "it will be needed later than others"
-        if load.spare:
-            return "no memory is free"
+            return None if has_room else Refused("it will be needed later than others")
+        if load.work is Purpose.SPARE:
+            return Refused("no memory is free")
         if not ledger.fits_at_all(load.estimate):
             needed, budget = format_bytes(load.estimate), format_bytes(ledger.budget_bytes)
-            return f"the cell needs {needed}, the whole budget is {budget}"
+            return Refused(f"the cell needs {needed}, the whole budget is {budget}")
         more = min(behind, ledger.budget_bytes // AHEAD_SHARE)
         if any(self._may_come(nbytes, now_s) for nbytes in (shortage + more, shortage)):
-            return ""
-        return f"the budget of {format_bytes(ledger.budget_bytes)} is in use"
+            return None
+        return Refused(f"the budget of {format_bytes(ledger.budget_bytes)} is in use")
 
     def wait(self, running: int, now_s: float) -> None:
         """Make the next load wait for memory, while ``running`` loads are running."""
@@ -124,9 +130,9 @@ class Room:
                 granted = self.loads.grow(load, nbytes)
                 if not granted and ledger.fits_at_all(nbytes):
                     shortage = ledger.shortage(nbytes - load.reserved)
-                    if load.prefetch:
+                    if load.work is Purpose.WISH:
                         freed = self.prefetcher.make_room(load, shortage, now_s)
-                    elif load.spare:
+                    elif load.work is Purpose.SPARE:
                         freed = False
                     else:
                         freed = self._may_come(shortage, now_s)

@@ -8,6 +8,7 @@ long.
 
 from __future__ import annotations
 
+import enum
 import math
 import os
 from collections import deque
@@ -18,7 +19,7 @@ from typing import Final, Protocol
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.loading.link import Link
-from shmmap.daemon.loading.loads import Loads
+from shmmap.daemon.loading.loads import Attempt, FailedFileCheck, LeftoverCheck, Load, Loads, Purpose
 from shmmap.daemon.loading.lost_workers import LostWorkers
 from shmmap.daemon.loading.prefetcher import Prefetcher
 from shmmap.daemon.loading.room import Room
@@ -36,7 +37,7 @@ from shmmap.daemon.loading.worker_messages import (
 )
 from shmmap.daemon.loading.worker_pool import NOT_OPENED, Opened, Worker, WorkerPool
 from shmmap.daemon.map.catalogue_view import CatalogueView
-from shmmap.daemon.records import SPACE_CODES, Failure, Key, Load, Resident, failure_code
+from shmmap.daemon.records import SPACE_CODES, Failure, Key, Resident, failure_code
 from shmmap.errors import Replaced
 from shmmap.failpoints import step
 from shmmap.installed import RESTART, is_replaced
@@ -127,6 +128,14 @@ def opened_of(catalogue: CatalogueView) -> Opened:
     return catalogue.opened.innermost(catalogue.id_prefix.rstrip("/"))
 
 
+class HandOut(enum.Enum):
+    """What has come of the next load."""
+
+    STARTED = "a worker has it"
+    SETTLED = "it has ended, waits apart from the others, or is other work now"
+    WAITS = "there is none, or it waits for a worker, for memory or for the link"
+
+
 class LoadObserver(Protocol):
     """Is notified of loads."""
 
@@ -212,9 +221,7 @@ class Scheduler:
             return self.loads.want(key, cache.estimate(index, layer), priority, asker, computed=computed)
         if failure.code in SPACE_CODES or failure.stamp is None:
             return None
-        load = self.loads.want(key, 0, priority, asker)
-        load.unless = failure.stamp
-        return load
+        return self.loads.check_failed_file(key, priority, asker, failure.stamp)
 
     def want_spare(self, index: int, layer: str, now_s: float, asker: Hashable) -> Load | None:
         """Load an absent cell for a spare request if that costs no client anything now; else return None.
@@ -224,12 +231,14 @@ class Scheduler:
         cache, pool = self._cache, self.pool
         key = cache.key(index, layer)
         load = self.loads.by_key.get(key)
-        if load is not None and (load.running or not load.prefetch):
+        if load is not None and (load.is_running or load.work is not Purpose.WISH):
             return load
         estimate, failure = cache.estimate(index, layer), self.loads.failures.get(key)
         if len(self.loads) or pool.free_places <= self.prefetcher.kept_places:
             return None
-        if any(one.spare for one in self._jobs.values()) or self._ledger.shortage(estimate) > 0:
+        if self._ledger.shortage(estimate) > 0:
+            return None
+        if any(one.work is Purpose.SPARE for one in self._jobs.values()):
             return None
         if self.link is not None and not self.link.may_begin(now_s, ahead=True):
             return None
@@ -256,7 +265,7 @@ class Scheduler:
     def _waits_for_pages(self, load: Load, now_s: float) -> bool:
         """Whether a load cannot start because the cells it reads are not known yet."""
         cache, pages = self._cache, self._cache.pages
-        if pages is None or load.unless is not None or load.adopted is not None:
+        if pages is None or not isinstance(load.work, Purpose):
             return False
         index = cache.index_of(load.key.cell_id)
         area = self._layers.looks_into(index, load.key.layer) if index is not None else None
@@ -306,85 +315,88 @@ class Scheduler:
         if self.link is not None:
             self.link.update(now_s)
         self._link_s = math.inf
-        self.unfinished = len(self.loads) > 0 and self._hand_out_one(now_s)
+        self.unfinished = len(self.loads) > 0 and self._hand_out_next(now_s) is not HandOut.WAITS
 
-    def _hand_out_one(self, now_s: float) -> bool:
-        """Hand out the next load; return False if there is none, or it has to wait."""
+    def _hand_out_next(self, now_s: float) -> HandOut:
+        """Give the next load to a worker, or end it, unless it has to wait."""
         if self.room.waited_for and self.room.still_waited_for(len(self._jobs), now_s):
-            return False
+            return HandOut.WAITS
         points, layers = self.pool.has_room(computed=False), self.pool.has_room(computed=True)
-        load = self.loads.next_queued(points=points, layers=layers) if points or layers else None
+        load = self.loads.choose(points=points, layers=layers) if points or layers else None
         if load is None:
-            return False
-        if load.computed and self._waits_for_pages(load, now_s):
-            return True
-        estimate, shortage = load.estimate, self._ledger.shortage(load.estimate)
-        if estimate and shortage > 0:
-            refusal = self.room.refusal(load, shortage, self.loads.bytes_behind(), now_s)
-            if refusal:
-                self._fail(load, "over_budget", refusal, None, now_s)
-            else:
-                self.room.wait(len(self._jobs), now_s)
-            return bool(refusal)
-        if (job := self._job(load, self._job_numbers + 1)) is None:
+            return HandOut.WAITS
+        index = self._cache.index_of(load.key.cell_id)
+        if index is None:  # its cell left the map
             self._end(load)
-            return True
-        if load.estimate > estimate:
-            return True  # the check was turned into a load that needs memory
-        if self._needed_bytes is not None:
-            load.link_bytes = self._needed_bytes(job) if isinstance(job, Job) else 0
+            return HandOut.SETTLED
+        if isinstance(load.work, LeftoverCheck):
+            resident = load.work.resident
+            if self._ledger.resident_named(resident.name) is not resident:  # it was retired
+                self._load_after_all(load)
+                return HandOut.SETTLED
+        if load.computed and self._waits_for_pages(load, now_s):
+            return HandOut.SETTLED
+        shortage = self._ledger.shortage(load.estimate) if load.estimate else 0
+        if shortage > 0:
+            refused = self.room.refusal(load, shortage, self.loads.bytes_behind(), now_s)
+            if refused is not None:
+                self._fail(load, "over_budget", refused.why, None, now_s)
+                return HandOut.SETTLED
+            self.room.wait(len(self._jobs), now_s)
+            return HandOut.WAITS
+        return self._start(load, index, now_s)
+
+    def _start(self, load: Load, index: int, now_s: float) -> HandOut:
+        """Give a load for which there is memory to a worker, if the link has room."""
+        layers, layer, attempt = self._layers, load.key.layer, Attempt(now_s)
+        if isinstance(load.work, Purpose):
+            sources = map(self._cache.catalogue.stamp, (index, *layers.neighbours(index, layer)))
+            attempt.sources, attempt.version = tuple(sources), layers.version(index, layer)
+        job = self._job(load, index, self._job_numbers + 1)
+        load.link_bytes = 0
+        if self._needed_bytes is not None and isinstance(job, Job):
+            load.link_bytes = self._needed_bytes(job)
         if not self._may_fetch(load, now_s):
-            return False
-        self.loads.start(load, now_s)
+            return HandOut.WAITS
+        self.loads.start(load, attempt)
         self._job_numbers += 1
+        is_wish = load.work is Purpose.WISH
         try:
-            taken = self.pool.submit(
-                job, now_s, prefetch=load.prefetch, opened=opened_of(self._cache.catalogue)
-            )
+            taken = self.pool.submit(job, now_s, prefetch=is_wish, opened=opened_of(self._cache.catalogue))
         except Replaced:
             message = f"{job.source.name}: no loader can start: {RESTART}"
             self._fail(load, "load_failed", message, None, now_s)
-            return True
+            return HandOut.SETTLED
         except OSError as error:
             self._fail(load, failure_code(error), f"no file for a segment: {error.strerror}", None, now_s)
-            return True
-        if taken:
-            self._jobs[job.number] = load
-            if load.prefetch:
-                self.prefetcher.started(load)
-            self._statistics.add("loads_started", isinstance(job, Job))
-        else:
+            return HandOut.SETTLED
+        if not taken:
             self.loads.requeue(load)
-        return taken
+            return HandOut.WAITS
+        self._jobs[job.number] = load
+        if is_wish:
+            self.prefetcher.started(load)
+        self._statistics.add("loads_started", isinstance(job, Job))
+        return HandOut.STARTED
 
     def _may_fetch(self, load: Load, now_s: float) -> bool:
         """Whether the link has room for a load; what is made from memory, and checks, need none."""
-        ahead = load.prefetch or load.spare
-        if self.link is None or not load.link_bytes or self.link.may_begin(now_s, ahead=ahead):
+        if self.link is None or not load.link_bytes or self.link.may_begin(now_s, ahead=load.is_ahead):
             return True
         # a wish waits for what is under way: whatever comes of that wakes the loop
-        self._link_s = self.link.rests_until_s if ahead else self.link.next_s()
+        self._link_s = self.link.rests_until_s if load.is_ahead else self.link.next_s()
         return False
 
-    def _job(self, load: Load, number: int) -> Job | Check | None:
-        """Return a worker's job for a load; None if its cell left the map, or it is no longer wanted."""
-        cache, catalogue = self._cache, self._cache.catalogue
-        index = cache.index_of(load.key.cell_id)
-        if index is None:
-            return None
-        if load.unless is not None:
-            return Check(number, catalogue.source(index), "", load.unless)
-        if load.adopted is not None:
-            if self._ledger.resident_named(load.adopted.name) is load.adopted:
-                return Check(number, catalogue.source(index), load.adopted.name, catalogue.stamp(index))
-            load.adopted = None  # the segment was retired before its check began
-            if not load.wanted:
-                return None
-            load.estimate = cache.estimate(index, load.key.layer)
-        layer = load.key.layer
-        load.sources = tuple(map(catalogue.stamp, (index, *self._layers.neighbours(index, layer))))
-        load.version = self._layers.version(index, layer)
-        return job_of(cache, number, index, layer, load.estimate)
+    def _job(self, load: Load, index: int, number: int) -> Job | Check:
+        """Return a worker's job for a load."""
+        catalogue = self._cache.catalogue
+        match load.work:
+            case FailedFileCheck(stamp):
+                return Check(number, catalogue.source(index), "", stamp)
+            case LeftoverCheck(resident):
+                return Check(number, catalogue.source(index), resident.name, catalogue.stamp(index))
+            case Purpose():
+                return job_of(self._cache, number, index, load.key.layer, load.estimate)
 
     def next_event_s(self) -> float:
         """Return when there is something to do if nothing arrives; infinity for never."""
@@ -426,27 +438,27 @@ class Scheduler:
             self.room.forget(message.number)
         load = self._jobs.pop(message.number, None)
         try:
-            if load is None:
+            if load is None or (attempt := load.attempt) is None:
                 return
-            load.spent_s = spent_s
-            load.took_s = now_s - load.started_s if worker.fetches else spent_s
+            attempt.spent_s = spent_s
+            attempt.took_s = now_s - attempt.started_s if worker.fetches else spent_s
             if isinstance(message, Checked):
                 self._on_checked(load, message, now_s)
             elif isinstance(message, Failed):
-                load.unread = message.unread
                 if message.message.endswith(RESTART):
                     is_replaced()  # so that the daemon notices, as its loader did
-                self._fail(load, message.code, message.message, message.stamp, now_s)
+                unread = message.unread
+                self._fail(load, message.code, message.message, message.stamp, now_s, unread=unread)
             elif fd >= 0:
                 step("daemon.received")
-                self._publish(load, message, fd, now_s)
+                self._publish(load, attempt, message, fd, now_s)
             else:  # the job was only a check
                 self._fail(load, "load_failed", "the loader says it has a segment", None, now_s)
         finally:
             if fd >= 0:
                 os.close(fd)
 
-    def _publish(self, load: Load, done: Done, fd: int, now_s: float) -> None:
+    def _publish(self, load: Load, attempt: Attempt, done: Done, fd: int, now_s: float) -> None:
         """Publish a finished segment."""
         cache, catalogue, key = self._cache, self._cache.catalogue, load.key
         index = cache.index_of(key.cell_id)
@@ -457,12 +469,12 @@ class Scheduler:
         if done.version != self._layers.version(index, key.layer):
             # its file, a neighbour's file or the map changed while it was made
             reads = (done.stamp, *done.neighbours)
-            if reads == load.sources and done.version != load.version:
+            if reads == attempt.sources and done.version != attempt.version:
                 message = f"the loader builds {key.layer} otherwise than the daemon knows: restart it"
                 self._fail(load, "load_failed", message, None, now_s)
                 return
             cells = (index, *self._layers.neighbours(index, key.layer))
-            self._map_switch.catch_up(cells, reads, load.sources)
+            self._map_switch.catch_up(cells, reads, attempt.sources)
             if done.version != self._layers.version(index, key.layer):
                 self.loads.requeue(load)
                 return
@@ -475,10 +487,10 @@ class Scheduler:
             box=catalogue.box(index),
             z_min=done.z_min,
             z_max=done.z_max,
-            last_use_s=0.0 if load.spare else now_s,
+            last_use_s=0.0 if load.work is Purpose.SPARE else now_s,
             load_ns=done.load_ns,
-            prefetched=load.prefetch,
-            spare=load.spare,
+            prefetched=load.work is Purpose.WISH,
+            spare=load.work is Purpose.SPARE,
         )
         try:
             replaces = cache.publish(fd, done.header_bytes, resident, index, now_s)
@@ -489,8 +501,8 @@ class Scheduler:
             self._fail(load, code, f"its segment cannot be published: {why}", None, now_s)
             return
         self.misplaced.note(key.cell_id, index, done.outside)
-        took_ns = int((now_s - load.started_s) * 1e9)
-        self._events.emit(self._events.loaded, resident, took_ns, replaces, done.cached, load.prefetch)
+        took_ns = int((now_s - attempt.started_s) * 1e9)
+        self._events.emit(self._events.loaded, resident, took_ns, replaces, done.cached, resident.prefetched)
         for warning in done.warnings:
             log.info("loaded with a warning", cell=key.cell_id, layer=key.layer, warning=warning)
         if done.dropped:
@@ -498,21 +510,25 @@ class Scheduler:
         self._end(load)
 
     def _on_checked(self, load: Load, message: Checked, now_s: float) -> None:
-        """Handle the result of checking an adopted segment, or a file that failed."""
-        if load.unless is not None:
-            self._on_looked(load, message)
-            return
-        resident, load.adopted = load.adopted, None
-        if resident is not None and not message.wrong and self._cache.accept(resident):
+        """Handle the result of a check."""
+        match load.work:
+            case LeftoverCheck(resident):
+                self._on_leftover_checked(load, resident, message, now_s)
+            case FailedFileCheck():
+                self._on_failed_file_checked(load, message)
+
+    def _on_leftover_checked(self, load: Load, resident: Resident, message: Checked, now_s: float) -> None:
+        """Hand out a segment of a previous run from now on, or reject it."""
+        if not message.wrong and self._cache.accept(resident):
             self._end(load)
             return
-        if resident is not None and message.wrong:
+        if message.wrong:
             self._cache.reject(resident, message.wrong, now_s)
         self._load_after_all(load)
 
-    def _on_looked(self, load: Load, message: Checked) -> None:
-        """Handle the check of a file that failed: if its state has changed, it is loaded at once."""
-        failure, load.unless = self.loads.failures.get(load.key), None
+    def _on_failed_file_checked(self, load: Load, message: Checked) -> None:
+        """If the state of a file that failed has changed, load it at once."""
+        failure = self.loads.failures.get(load.key)
         if not message.wrong:
             self._end(load, failure)
             return
@@ -524,22 +540,37 @@ class Scheduler:
         self._load_after_all(load)
 
     def _load_after_all(self, load: Load) -> None:
+        """After a check, load the cell if a client has asked for it."""
         index = self._cache.index_of(load.key.cell_id)
-        if load.wanted and index is not None:
-            load.estimate = self._cache.estimate(index, load.key.layer)
+        is_asked_for = not isinstance(load.work, LeftoverCheck) or load.work.is_asked_for
+        if is_asked_for and index is not None:
+            load.work, load.estimate = Purpose.DEMAND, self._cache.estimate(index, load.key.layer)
             self.loads.requeue(load)
         else:
             self._end(load)
 
-    def _fail(self, load: Load, code: str, message: str, stamp: Stamp | None, now_s: float) -> None:
-        """End a load without a segment; the back-off doubles if the previous failure had the same reason."""
-        if load.adopted is not None or load.unless is not None:
-            self._on_checked(load, Checked(0, message if load.unless is None else ""), now_s)
+    def _fail(
+        self,
+        load: Load,
+        code: str,
+        message: str,
+        stamp: Stamp | None,
+        now_s: float,
+        *,
+        unread: bool = False,
+    ) -> None:
+        """End a load without a segment; the back-off doubles if the previous failure had the same reason.
+
+        ``unread``: its source could not be read.
+        """
+        if not isinstance(load.work, Purpose):
+            is_leftover = isinstance(load.work, LeftoverCheck)
+            self._on_checked(load, Checked(0, message if is_leftover else ""), now_s)
             return
         if code in SPACE_CODES:
-            if load.prefetch:
+            if load.work is Purpose.WISH:
                 self.prefetcher.full(now_s)
-            if load.prefetch or load.spare:
+            if load.is_ahead:
                 self._end(load)
                 return
             self._statistics.add("refused_over_budget")
@@ -553,11 +584,10 @@ class Scheduler:
             return
         failure = self.loads.failure(load.key, code, message, stamp, now_s)
         self._events.emit(self._events.failed, load.key, failure, now_s)
-        self._end(load, failure)
+        self._end(load, failure, out=unread or code == "load_timeout")
 
-    def _end(self, load: Load, failure: Failure | None = None) -> None:
-        """End a load."""
-        out = failure is not None and (load.unread or failure.code == "load_timeout")
-        self.prefetcher.note_end(load, load.took_s or load.spent_s, out=out)
+    def _end(self, load: Load, failure: Failure | None = None, *, out: bool = False) -> None:
+        """End a load; ``out``: its source did not answer."""
+        self.prefetcher.note_end(load, out=out)
         self.loads.finish(load, failure)
         self._observer.load_finished(load.key)

@@ -68,7 +68,7 @@ class PublishedView:
         self._differing: tuple[Root, list[_Pair]] | None = None
         self._compared: set[_Pair] = set()
         self._found = _Difference([], [], [], [])
-        self._changed: tuple[Indices, Indices, Indices, Indices] | None = None
+        self._changed: tuple[Indices, Indices, Indices, Indices, bool] | None = None
 
     @cached_property
     def _ready(self) -> dict[str, int]:
@@ -207,7 +207,9 @@ class PublishedView:
         """
         if not isinstance(before, PublishedView):
             raise TypeError(f"{type(before).__name__} is no version of a published map")
-        unknown = CatalogueChange(before, self, _NOTHING, _NOTHING, _NOTHING, _NOTHING, known=False)
+        unknown = CatalogueChange(
+            before, self, _NOTHING, _NOTHING, _NOTHING, _NOTHING, same_numbers=False, known=False
+        )
         same_ids = before.id_prefix == self.id_prefix
         if self._differing is None or self._differing[0] is not before.root:
             self._compared.clear()
@@ -227,10 +229,12 @@ class PublishedView:
         if None in ours.values():
             return unknown
         if self._changed is None:
+            # a cell that went to another shard shifts the numbers of others
+            same_numbers = not self._found.added and not self._found.removed
             if same_ids and self._found.added and self._found.removed:
                 self._note_moved(before)
             added, removed, changed, moved = (np.sort(np.array(some, np.intp)) for some in self._found)
-            self._changed = added, removed, changed, moved
+            self._changed = added, removed, changed, moved, same_numbers
         return CatalogueChange(before, self, *self._changed)
 
     def _note_moved(self, before: PublishedView) -> None:

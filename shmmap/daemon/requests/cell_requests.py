@@ -18,9 +18,10 @@ from typing import Final, TypeVar
 import msgspec
 
 from shmmap.daemon.cache.cell_cache import CellCache
+from shmmap.daemon.loading.loads import Load
 from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.map.catalogue_view import PageNews
-from shmmap.daemon.records import SPACE_CODES, Load, Resident
+from shmmap.daemon.records import SPACE_CODES, Resident
 from shmmap.daemon.requests import limits
 from shmmap.daemon.requests.differential import difference, warm_difference
 from shmmap.daemon.requests.pending_request import LARGE, Found, MapChanged, PendingRequest, WaitingList

@@ -14,7 +14,7 @@ from functools import partial
 from typing import Final
 
 from shmmap.daemon.cache.holders import Survey, Usage
-from shmmap.daemon.live.relay import LiveRelay, NoLiveMaps
+from shmmap.daemon.live_relay import LiveRelay, NoLiveMaps
 from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.daemon.requests.handshake import Handshake
 from shmmap.daemon.requests.limits import check_intent

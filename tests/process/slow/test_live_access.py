@@ -17,7 +17,8 @@ import pytest
 
 import shmmap
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.client.live.live_map import ChunkInfo, LiveMap
+from shmmap.client.live.chunk_reader import ChunkInfo
+from shmmap.client.live.live_map import LiveMap
 from tests.process.conftest import DaemonFactory
 from tests.support.accounts import (
     ADMINS,

@@ -18,7 +18,7 @@ import pytest
 
 from tests.process.conftest import DaemonFactory
 from tests.support.command_line import Shmmap
-from tests.support.daemon_process import DaemonProcess, first_answer, until, wait_ended
+from tests.support.daemon_process import DaemonProcess, counters, first_answer, until, wait_ended
 from tests.support.divided_map import DividedMap, make_map, random_points
 from tests.support.process_costs import peak_bytes
 from tests.support.raw_client import RawCells, RawClient, circle
@@ -418,6 +418,7 @@ def test_the_daemon_goes_on(
     assert client.ask("stats")[4]["defects"] == 3
     assert one.log.count(" ERROR   defect place=") == 1, "once in a while, not each time"
     assert "RuntimeError: a defect at daemon.unlink" in one.log
+    until(lambda: counters(one)["defects"] == 3)  # the statistics segment follows
     shmmap = Shmmap(one, tmp_path)
     assert shmmap("health").rstrip().endswith("; it survived 3 exceptions, see its log")
     assert shmmap.json("health")["defects"] == 3

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -212,7 +213,7 @@ def test_a_map_that_is_long_in_coming_is_waited_for(drive: TownDrive, daemon: Da
     stopped = [parent, *one.stop_loaders()]
     waiting = Deadline()
     with (
-        StatisticsReader(one.instance, one.shm_dir) as statistics,
+        closing(StatisticsReader(one.instance, one.shm_dir)) as statistics,
         MapUpdater(one.endpoint, rules) as maps,
         ThreadPoolExecutor(1) as thread,
     ):
@@ -237,7 +238,7 @@ def test_the_daemon_fetches_what_lies_ahead(
     with (
         shmmap.connect(one.endpoint) as client,
         shmmap.events.EventStream(one.endpoint) as stream,
-        StatisticsReader(one.instance, one.shm_dir) as statistics,
+        closing(StatisticsReader(one.instance, one.shm_dir)) as statistics,
         MapUpdater(one.endpoint, rules, route=route) as maps,
     ):
         (cell,) = client.metadata(shmmap.Circle(x + ahead_m, y, 1.0))

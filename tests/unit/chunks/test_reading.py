@@ -16,8 +16,8 @@ import pytest
 from shmmap.chunks.layout import ChunkIdentity, ChunkView, chunk_bytes, new_header
 from shmmap.chunks.reading import TRIES, read_chunk, select_voxels
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.chunk_memory import ChunkFile, ChunkMemory, live_prefix
 from shmmap.errors import BadRequest
+from shmmap.live_worker.chunk_memory import ChunkFile, ChunkMemory, live_prefix
 from tests.support.chunk_memory import ChunkMemory as Unbounded
 from tests.support.daemon_process import ROOT, Deadline
 from tests.support.live_drive import RESOLUTION, marked

@@ -247,10 +247,13 @@ class PagedView:
         )  # fmt: skip
         nothing = np.empty(0, np.intp)
         if not known:
-            return CatalogueChange(before, self, nothing, nothing, nothing, nothing, known=False)
+            return CatalogueChange(
+                before, self, nothing, nothing, nothing, nothing, same_numbers=False, known=False
+            )
+        same_numbers = change.same_numbers and np.array_equal(own, its)
         return CatalogueChange(
             before, self, np.sort(own[change.added]), np.sort(its[change.removed]),
-            np.sort(own[change.changed]), np.sort(own[change.moved]),
+            np.sort(own[change.changed]), np.sort(own[change.moved]), same_numbers,
         )  # fmt: skip
 
     def ids(self, indices: Indices) -> list[str]:

@@ -16,6 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shmmap.cli.entry import build_parser
+from shmmap.config_table import parse_bytes
 from shmmap.daemon.config import (
     DROPPED,
     RENAMED,
@@ -27,9 +28,8 @@ from shmmap.daemon.config import (
     read_settings_file,
     trace_settings,
 )
-from shmmap.daemon.config_live import LIVE_ROWS, LiveSettings, live_directory, live_settings
-from shmmap.daemon.config_table import parse_bytes
 from shmmap.errors import ConfigError
+from shmmap.live_settings import LIVE_ROWS, LiveSettings, live_directory, live_settings
 from shmmap.service.installation import configuration
 from tests.support.daemon_process import ROOT
 

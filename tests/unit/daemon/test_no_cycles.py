@@ -16,7 +16,8 @@ import pytest
 import zmq
 
 import shmmap.daemon
-from shmmap.daemon.records import Key, Load
+from shmmap.daemon.loading.loads import Load
+from shmmap.daemon.records import Key
 from shmmap.protocol import messages as m
 from shmmap.protocol.codec import encode, pack_versions
 from tests.support.divided_map import DividedMap, random_points
@@ -72,7 +73,7 @@ def connected(one: WholeDaemon, context: zmq.Context[Any]) -> zmq.Socket[Any]:
 
 def test_what_refers_to_itself_is_found() -> None:
     load = Load(Key("0_0.pcd", "points"), 100, 0.0, 1)
-    load.payer = (load,)
+    load.asker = (load,)
     del load
     assert left_behind() == ["Key", "Load"]
 

@@ -21,11 +21,11 @@ from typing import Any, cast
 import pytest
 
 import shmmap
+from shmmap import live_messages as live
 from shmmap.chunks.marks import encode_marks
 from shmmap.daemon import turns
-from shmmap.daemon.config_live import LiveSettings
-from shmmap.daemon.live import messages as live
-from shmmap.daemon.live.worker.main import _Worker
+from shmmap.live_settings import LiveSettings
+from shmmap.live_worker.main import _Worker
 from shmmap.processes.start_child import channel, packet_buffer, receive_packet
 from shmmap.protocol import live as messages
 from shmmap.protocol import messages as m
@@ -66,9 +66,9 @@ class Walker:
         self.files: set[str] = set()
 
     @property
-    def of_daemon(self) -> set[str]:
-        """Files of the daemon."""
-        return {file.removeprefix("daemon/") for file in self.files if file.startswith("daemon/")}
+    def of_server(self) -> set[str]:
+        """Files of the daemon, or of its live worker."""
+        return {file for file in self.files if file.startswith(("daemon/", "live_worker/"))}
 
     @property
     def count(self) -> int:
@@ -107,7 +107,7 @@ def listed(number: int) -> set[str]:
     text = ARCHITECTURE.read_text(encoding="utf-8")
     sections = re.findall(rf"^### {number}\. .*?\n(.*?)(?=^##|\Z)", text, re.MULTILINE | re.DOTALL)
     (section,) = sections
-    return set(re.findall(r"^\d+\. `daemon/([a-z_/]+\.py)`", section, re.MULTILINE))
+    return set(re.findall(r"^\d+\. `((?:daemon|live_worker)/[a-z_/]+\.py)`", section, re.MULTILINE))
 
 
 def test_warm_differential(whole: Callable[..., WholeDaemon], small_map: DividedMap) -> None:
@@ -118,7 +118,7 @@ def test_warm_differential(whole: Callable[..., WholeDaemon], small_map: Divided
     named = tuple(m.HeldCell(cell.id, cell.version) for cell in cells[8:10])
     reply = one.ask(m.Differential(3, EVERYWHERE, held=named, packed=pack_versions(held)), walker.walking())
     assert len(reply.cells) == 6
-    assert walker.of_daemon == listed(1)
+    assert walker.of_server == listed(1)
     assert walker.count <= 15
 
 
@@ -131,7 +131,7 @@ def test_cold_load(whole: Callable[..., WholeDaemon], small_map: DividedMap) -> 
         m.Differential(3, area, packed=pack_versions([held[0].version]), wait=30.0), walker.walking()
     )
     assert [Path(cell.id).name for cell in reply.cells] == ["20_20.pcd"]
-    assert walker.of_daemon == listed(2)
+    assert walker.of_server == listed(2)
     assert walker.count <= 36
 
 
@@ -152,7 +152,7 @@ def test_eviction(whole: Callable[..., WholeDaemon], tmp_path: Path) -> None:
         one.ask(m.Release(100 + number))
     assert one.memory.cache.evictor.evicted_count > 0
     assert len(held) == len(everything)
-    files = asking.of_daemon | sweeping.of_daemon | {"loading/scheduler.py"}
+    files = asking.of_server | sweeping.of_server | {"daemon/loading/scheduler.py"}
     assert files == listed(3)
     assert len(files) <= 11
 
@@ -189,12 +189,12 @@ def test_a_scan_into_a_live_map(tmp_path: Path) -> None:
         opened = answer(messages.LiveOpen(1, "lidar", "front"))
         assert answer(scan(2)).scan == 2
         one = worker._maps["lidar"]
-        while waiting(len(one.live.chunks) < 27 or one.status().loading > 0):
+        while waiting(len(one.paged.chunks) < 27 or one.status().loading > 0):
             worker.run_turn()
         walker = Walker()
         second = scan(3)
         with walker.walking():
             assert answer(second).scan == 3
         worker.end(live.End(keep=False))
-    assert walker.of_daemon == listed(4)
-    assert len(walker.of_daemon) <= 14
+    assert walker.of_server == listed(4)
+    assert len(walker.of_server) <= 14

@@ -17,7 +17,7 @@ from shmmap.daemon.assembly import Service
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.host.scheduling import take_slices
 from shmmap.daemon.host.signals import StartSignals
-from shmmap.daemon.live.relay import NoLiveMaps
+from shmmap.daemon.live_relay import NoLiveMaps
 from shmmap.daemon.map.catalogue_reload import Reloader
 from shmmap.daemon.map.catalogue_view import ViewOrigin
 from shmmap.daemon.map_in_memory import MapInMemory

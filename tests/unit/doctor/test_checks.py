@@ -15,11 +15,11 @@ import pytest
 from msgspec.structs import replace
 
 from shmmap.daemon.config import DaemonConfig
-from shmmap.daemon.config_live import LiveSettings
 from shmmap.doctor import access, cells, daemon, live, memory, published, verdicts
 from shmmap.doctor.checks import CHECKS, diagnose, examine
 from shmmap.doctor.diagnosis import Diagnosis, Machine
 from shmmap.doctor.verdicts import Finding, cache_verdict, worst
+from shmmap.live_settings import LiveSettings
 from shmmap.protocol.rows import ClientRow, LiveMapRow
 from shmmap.statistics.counters import COUNTER_NAMES, REFUSALS
 from shmmap.statistics.reader import Snapshot

@@ -175,7 +175,7 @@ def test_compare_equals_set_differences(old: dict[str, SourceStamp], new: dict[s
     assert change.ids("changed") == tuple(sorted(i for i in old.keys() & new.keys() if old[i] != new[i]))
     assert change.ids("moved") == ()
     assert bool(change) == (old != new)
-    assert change.same_cells == (old.keys() == new.keys())
+    assert change.same_numbers == (old.keys() == new.keys())
 
 
 places = st.sampled_from(["/m/", "/m/v1/", "/m/v1/x/", "/n/", "/"])

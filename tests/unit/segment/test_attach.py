@@ -20,8 +20,9 @@ import pytest
 from shmmap.errors import SegmentCorrupt, SegmentError, StaleHandle
 from shmmap.segment import attach as attach_module
 from shmmap.segment.attach import Owned, attach
-from shmmap.segment.directory import DEFAULT_SHM_DIR, ShmDirectory
+from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.header import PublishBlock
+from shmmap.segment.names import DEFAULT_SHM_DIR
 from shmmap.segment.pins import prepare_process
 from tests.support.process_costs import mappings_under
 from tests.support.segment_reader import read_segment

@@ -7,6 +7,7 @@ import os
 import struct
 import threading
 import zlib
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,7 +29,7 @@ def test_no_file_at_all(shm: ShmDirectory, kind: str) -> None:
         os.mkdir(path)
     else:
         os.symlink("/dev/null", path)
-    with StatisticsReader("unit", shm.path) as reader:
+    with closing(StatisticsReader("unit", shm.path)) as reader:
         for _ in range(2):
             with pytest.raises(SegmentCorrupt):
                 reader.snapshot()

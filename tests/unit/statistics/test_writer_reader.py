@@ -44,7 +44,7 @@ def test_durations_come_back(shm: ShmDirectory, writer: StatisticsWriter) -> Non
 
 
 def test_one_reader_follows_the_daemon_s_runs(shm: ShmDirectory, identity: DaemonIdentity) -> None:
-    with StatisticsReader("unit", shm.path) as reader:
+    with contextlib.closing(StatisticsReader("unit", shm.path)) as reader:
         assert reader.snapshot().state == "absent"
         first = StatisticsWriter(shm, "unit", identity)
         assert reader.snapshot().identity == identity

@@ -8,8 +8,6 @@ from collections.abc import Sequence
 from shmmap_clients.command_line import run_program
 from shmmap_clients.ndt_scan_matcher.cli import align, follow, machine
 
-__all__ = ["main"]
-
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb and return the exit code."""

@@ -6,8 +6,6 @@ from __future__ import annotations
 from shmmap.cli.options import Subparsers, add_verb
 from shmmap.cli.verbs.live import files, served
 
-__all__ = ["add_parser"]
-
 
 def add_parser(subparsers: Subparsers) -> None:
     """Add the verb ``live``."""

@@ -27,8 +27,8 @@ from shmmap.errors import BadRequest, MapDataError, MapMissing, ShmmapError
 from shmmap.formats.durable_file import writing_errors
 
 if TYPE_CHECKING:
-    from shmmap.daemon.live.disk.exporting import ExportedVoxels, Format
-    from shmmap.daemon.live.disk.maintenance import CheckedMap
+    from shmmap.live_worker.disk.exporting import ExportedVoxels, Format
+    from shmmap.live_worker.disk.maintenance import CheckedMap
 
 
 def _add_directory(parser: argparse.ArgumentParser) -> None:
@@ -67,14 +67,14 @@ def _directory_from(args: argparse.Namespace) -> str:
 def _places() -> Iterator[tuple[str, str]]:
     """Yield names and directories of live maps: of the settings, of a daemon that runs, and default ones."""
     from shmmap.daemon.config import installed_config_file, load_config
-    from shmmap.daemon.config_live import SERVICE_STATE, state_directory
     from shmmap.doctor.daemon_lists import DaemonLists
+    from shmmap.live_settings import SERVICE_STATE, state_directory
     from shmmap.statistics.reader import read_statistics
 
     config = load_config({}, file=installed_config_file())
     yield from ((one.name, one.path) for one in config.live if one.path)
     with contextlib.suppress(ShmmapError, OSError):  # no daemon, which may have been given another directory
-        with DaemonLists() as lists:
+        with contextlib.closing(DaemonLists()) as lists:
             lists.add_to(served := read_statistics(config.instance, config.shm_dir))
         yield from ((row.name, row.path) for row in served.live)
     for state in filter(None, (state_directory(config.instance), f"{SERVICE_STATE}/{config.instance}")):
@@ -114,13 +114,13 @@ def add_fsck(subparsers: Subparsers) -> None:
 
 def run_fsck(args: argparse.Namespace) -> int:
     """Check the database, and repair it if requested."""
-    from shmmap.daemon.live.disk.maintenance import check, repair
-    from shmmap.daemon.live.disk.stored_map import opened_folder, opened_folder_to_read, require_database
+    from shmmap.live_worker.disk.maintenance import check, repair
+    from shmmap.live_worker.disk.stored_map import opened_folder, opened_folder_to_read, require_database
 
     path = _directory_from(args)
     if args.read_only:
-        with opened_folder_to_read(path) as files:
-            found = check(files, path)
+        with opened_folder_to_read(path) as folder:
+            found = check(folder, path)
     else:
         busy = "--read-only looks at it nevertheless"
         with opened_folder(path, f"stop it; {busy}") as folder:
@@ -220,12 +220,12 @@ def add_export(subparsers: Subparsers) -> None:
 
 def _run_export(args: argparse.Namespace) -> int:
     """Export the map, and print the result."""
-    from shmmap.daemon.live.disk.exporting import export
-    from shmmap.daemon.live.disk.stored_map import StoredMap, opened_folder_to_read
+    from shmmap.live_worker.disk.exporting import export
+    from shmmap.live_worker.disk.stored_map import opened_map
 
     path = _directory_from(args)
     began_s = time.monotonic()
-    with opened_folder_to_read(path) as files, StoredMap(files, path) as stored:
+    with opened_map(path) as stored:
         made = export(
             stored,
             args.output,
@@ -306,8 +306,8 @@ def add_reset(subparsers: Subparsers) -> None:
 
 def _run_reset(args: argparse.Namespace) -> int:
     """Move the files aside, or delete them."""
-    from shmmap.daemon.live.disk.maintenance import files_of_map, reset
-    from shmmap.daemon.live.disk.stored_map import opened_folder
+    from shmmap.live_worker.disk.maintenance import files_of_map, reset
+    from shmmap.live_worker.disk.stored_map import opened_folder
 
     path = _directory_from(args)
     with opened_folder(path, "stop the daemon: it would go on with the files that it knows") as folder:

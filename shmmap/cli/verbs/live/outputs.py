@@ -70,7 +70,7 @@ class Saved(msgspec.Struct):
 
 def checked_kind() -> object:
     """Return the struct that ``fsck --json`` prints; its totals count sound chunks only."""
-    from shmmap.daemon.live.disk.maintenance import CheckedMap
+    from shmmap.live_worker.disk.maintenance import CheckedMap
 
     kind = more_of(CheckedMap, good=bool, chunks=int, **dict.fromkeys(TOTALS, int))
     return msgspec.defstruct(
@@ -80,13 +80,13 @@ def checked_kind() -> object:
 
 def exported_kind() -> object:
     """Return the struct that ``export --json`` prints."""
-    from shmmap.daemon.live.disk.exporting import ExportedVoxels
+    from shmmap.live_worker.disk.exporting import ExportedVoxels
 
     return more_of(ExportedVoxels, seconds=float)
 
 
 def reset_kind() -> object:
     """Return the struct that ``reset --json`` prints."""
-    from shmmap.daemon.live.disk.maintenance import ResetMap
+    from shmmap.live_worker.disk.maintenance import ResetMap
 
     return ResetMap

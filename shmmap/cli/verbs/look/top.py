@@ -91,7 +91,7 @@ def _show(args: argparse.Namespace, found: Snapshot, identity: DaemonIdentity, a
         for line in screen(found, identity, width=width):
             print_styled(line)
     else:
-        with StatisticsReader(*locate(args)) as reader:
+        with contextlib.closing(StatisticsReader(*locate(args))) as reader:
             return _live(reader, asked, max(args.interval, SHORTEST_S))
     return DaemonUnreachable.exit_code if found.state == "dead" else 0
 

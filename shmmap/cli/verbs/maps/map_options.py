@@ -164,7 +164,7 @@ def verified_at(store: Store, args: argparse.Namespace) -> Verified | None:
     """Return the current version, verified by the root of trust; None if no root was given."""
     if args.trust is None:
         return None
-    from shmmap.daemon.config_live import state_directory
+    from shmmap.live_settings import state_directory
     from shmmap.origin.remote.store import may_be_plain
     from shmmap.origin.remote.verify_apart import VerifySettings, verify_apart
 

@@ -95,7 +95,7 @@ def run_check(args: argparse.Namespace) -> int:
 def run_show(args: argparse.Namespace) -> int:
     """Print every setting and its source."""
     from shmmap.daemon.config import ROWS, installed_config_file, trace_settings
-    from shmmap.daemon.config_live import LIVE_ROWS
+    from shmmap.live_settings import LIVE_ROWS
 
     file = args.file or installed_config_file()
     settings = trace_settings({}, file=file)

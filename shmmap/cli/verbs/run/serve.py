@@ -7,8 +7,8 @@ import argparse
 import os
 
 from shmmap.cli.options import Subparsers, add_verb
+from shmmap.config_table import Row
 from shmmap.daemon.config import DROPPED, RENAMED, ROWS, SECTIONS, load_config, option_of
-from shmmap.daemon.config_table import Row
 
 _EPILOG = """\
 Settings come from FILE, then from SHMMAP_* variables (SHMMAP_BUDGET=2G), then from options.

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.disk.folder import Folder
-from shmmap.daemon.live.disk.map_files import MapFiles
+from shmmap.live_worker.disk.folder import Folder
+from shmmap.live_worker.disk.map_database import MapDatabase
 from tests.support.divided_map import read_pcd
 from tests.support.live_drive import SETTINGS
 from tests.support.live_reference import contents, old_directory, stored_drive
@@ -153,9 +153,9 @@ def test_exports_of_a_damaged_map(directory: Path, verb: Verb, tmp_path: Path) -
     words = ["live", "export", str(directory), "-o", str(tmp_path / "out.ply")]
     assert "hint: `shmmap live fsck`" in verb(words, 65).err
     assert not (tmp_path / "out.ply").exists()
-    with closing(Folder(directory)) as folder, closing(MapFiles(folder, SETTINGS)) as files:
-        assert files.load(ChunkKey.from_text(key)) is None  # as a daemon that finds it
-        files.write_record()
+    with closing(Folder(directory)) as folder, closing(MapDatabase(folder, SETTINGS)) as database:
+        assert database.load(ChunkKey.from_text(key)) is None  # as a daemon that finds it
+        database.write_record()
     said = verb([*words, "--json"])
     assert json.loads(said.out)["lost"] == [key]
     assert f"what is lost of 1 chunk: {key}" in said.err

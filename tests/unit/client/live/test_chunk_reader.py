@@ -22,8 +22,8 @@ from shmmap.chunks.layout import HEADER_BYTES, MAX_BYTES, ChunkIdentity, ChunkVi
 from shmmap.chunks.voxels import BRICKS, ChunkKey
 from shmmap.client.live import chunk_reader
 from shmmap.client.live.chunk_reader import ChunkInfo, ChunkReader, Place
-from shmmap.daemon.live.chunk_memory import ChunkFile, ChunkMemory, live_prefix
 from shmmap.errors import SegmentCorrupt, SegmentError
+from shmmap.live_worker.chunk_memory import ChunkFile, ChunkMemory, live_prefix
 from tests.support.daemon_process import ROOT
 
 KEY = ChunkKey(0, 0, 0)

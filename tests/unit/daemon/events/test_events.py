@@ -19,7 +19,7 @@ from shmmap.daemon.events.cell_events import (
     PressureEvents,
 )
 from shmmap.daemon.events.log import REMEMBERED, SENT_TOGETHER, EventLog, MinuteLog
-from shmmap.daemon.live.relay import LiveEvents
+from shmmap.daemon.live_relay import LiveEvents
 from shmmap.daemon.records import Key
 from shmmap.daemon.transport.sessions import Session, Sessions
 from shmmap.geometry import Circle

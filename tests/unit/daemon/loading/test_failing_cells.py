@@ -14,7 +14,7 @@ import pytest
 from shmmap import MapWindow, Offline, connect
 from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.loading import loads
-from shmmap.daemon.loading.loads import Loads
+from shmmap.daemon.loading.loads import Attempt, FailedFileCheck, Loads
 from shmmap.daemon.records import Failure, Key
 from shmmap.protocol.codec import pack_versions
 from shmmap.protocol.messages import Differential, Selected
@@ -124,7 +124,7 @@ def test_a_request_that_does_not_wait_is_answered_at_once(broken: InnerDaemon, s
         assert [failure.code for failure in reply.failed] == ["load_failed"]
         assert not reply.pending
         (load,) = broken.loads.by_key.values()
-        assert load.unless is not None
+        assert isinstance(load.work, FailedFileCheck)
         small_map.change(CELL, 5)
     assert ask(broken, 3) == [CELL]
     assert not broken.loads.failures
@@ -179,7 +179,7 @@ def test_failures_are_remembered_up_to_a_number(monkeypatch: pytest.MonkeyPatch)
     def fail(number: int, code: str) -> Key:
         key = Key(f"/{number}.pcd", "points")
         load = loads.want(key, 0, 1.0)
-        assert loads.start(load, 0.0)
+        assert loads.start(load, Attempt(0.0))
         loads.finish(load, Failure(code, "", None, 0.0, 0.0))
         return key
 

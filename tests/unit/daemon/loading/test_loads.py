@@ -6,23 +6,34 @@ from __future__ import annotations
 from collections.abc import Hashable
 from itertools import count
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmmap.daemon.loading.loads import BACKGROUND, LoadQueue
-from shmmap.daemon.records import Key, Load
+from shmmap.daemon.cache.ledger import Ledger
+from shmmap.daemon.loading.loads import (
+    BACKGROUND,
+    Attempt,
+    FailedFileCheck,
+    LeftoverCheck,
+    Load,
+    LoadQueue,
+    Loads,
+    Purpose,
+)
+from shmmap.daemon.records import Key, Resident
 
 _numbers = count()
 
 
-def load(nbytes: int = 1 << 20) -> Load:
-    return Load(Key("", ""), nbytes, 0.0, next(_numbers))
+def load(nbytes: int = 1 << 20, asker: Hashable = None) -> Load:
+    return Load(Key("", ""), nbytes, 0.0, next(_numbers), asker=asker)
 
 
 def start(queue: LoadQueue) -> Load | None:
-    one = queue.next()
+    one = queue.choose()
     if one is not None:
-        queue.started(one)
+        queue.start(one)
     return one
 
 
@@ -55,15 +66,14 @@ def test_turns_are_by_the_time_that_loads_took_in_the_end() -> None:
     """Small files whose layers take seconds; their client waits while the other one is served."""
     queue = LoadQueue()
     for _ in range(20):
-        queue.push(load(1 << 10), 0.0, "slow")
-        queue.push(load(1 << 20), 0.0, "quick")
+        queue.push(load(1 << 10, "slow"), 0.0, "slow")
+        queue.push(load(1 << 20, "quick"), 0.0, "quick")
     served: list[Hashable] = []
     for _ in range(12):
         one = start(queue)
         assert one is not None
-        served.append(one.payer)
-        one.spent_s = 8.0 if one.payer == "slow" else 1.0
-        queue.ended(one)
+        served.append(one.asker)
+        queue.end(one, 8.0 if one.asker == "slow" else 1.0)
     assert served.count("slow") == 2
     assert served.count("quick") == 10
 
@@ -71,16 +81,15 @@ def test_turns_are_by_the_time_that_loads_took_in_the_end() -> None:
 def test_a_debt_is_remembered_while_others_wait() -> None:
     """A client that asks for one slow layer after the other still owes the time of the last one."""
     queue = LoadQueue()
-    queue.push(load(), 0.0, "slow")
+    queue.push(load(asker="slow"), 0.0, "slow")
     for _ in range(10):
-        queue.push(load(), 0.0, "quick")
+        queue.push(load(asker="quick"), 0.0, "quick")
     served: list[Hashable] = []
     while (one := start(queue)) is not None:
-        served.append(one.payer)
-        one.spent_s = 5.0 if one.payer == "slow" else 1.0
-        queue.ended(one)
-        if one.payer == "slow":
-            queue.push(load(), 0.0, "slow")
+        served.append(one.asker)
+        queue.end(one, 5.0 if one.asker == "slow" else 1.0)
+        if one.asker == "slow":
+            queue.push(load(asker="slow"), 0.0, "slow")
         if len(served) == 11:
             break
     assert served.count("slow") == 2
@@ -88,14 +97,13 @@ def test_a_debt_is_remembered_while_others_wait() -> None:
     for asker in ("slow", "quick"):  # no client waited in between: nothing is owed
         queue.push(one := load(), 0.0, asker)
         assert start(queue) is one
-        one.spent_s = 5.0
-        queue.ended(one)
-        assert queue.next() is None
-    queue.push(load(), 1.0, "slow")
-    queue.push(load(), 2.0, "quick")
+        queue.end(one, 5.0)
+        assert queue.choose() is None
+    queue.push(load(asker="slow"), 1.0, "slow")
+    queue.push(load(asker="quick"), 2.0, "quick")
     first = start(queue)
     assert first is not None
-    assert first.payer == "slow"
+    assert first.asker == "slow"
 
 
 def test_what_goes_back_costs_nothing() -> None:
@@ -105,7 +113,7 @@ def test_what_goes_back_costs_nothing() -> None:
     queue.push(first, 0.0, "a")
     queue.push(second, 1.0, "b")
     assert start(queue) is first
-    queue.ended(first)
+    queue.end(first, 0.0)
     queue.push(first, 0.0, "a")
     assert start(queue) is first
 
@@ -116,10 +124,10 @@ def test_points_pass_layers_that_no_loader_can_take() -> None:
     layer.computed = True
     queue.push(layer, 0.0, "a")
     queue.push(points, 9.0, "a")
-    assert queue.next(layers=False) is points
-    assert queue.next(points=False) is layer
-    assert queue.next(points=False, layers=False) is None
-    assert queue.next() is layer
+    assert queue.choose(layers=False) is points
+    assert queue.choose(points=False) is layer
+    assert queue.choose(points=False, layers=False) is None
+    assert queue.choose() is layer
 
 
 def test_what_no_request_waits_for_comes_last() -> None:
@@ -162,3 +170,63 @@ def test_everything_comes_once_and_nearest_first_of_each(steps: list[tuple[str, 
                 for asker, priority in mine.items()
             ), "one client's nearest"
         assert len(queue) == len(waiting)
+
+
+# --- what a load is for -----------------------------------------------------------------------------------
+
+KEY = Key("/map/0.pcd", "points")
+
+
+def leftover() -> Resident:
+    return Resident("/shmmap.x.1", KEY, 1, 4096, 1, (0.0, 0.0, 1.0, 1.0), 0.0, 1.0, checked=False)
+
+
+@pytest.fixture
+def loads() -> Loads:
+    return Loads(Ledger(1 << 20))
+
+
+@pytest.mark.parametrize("runs", [False, True])
+def test_a_demand_takes_over_what_was_loaded_ahead(loads: Loads, runs: bool) -> None:
+    wish = loads.prefetch(KEY, 100, 5.0, computed=False)
+    assert (wish.work, wish.is_ahead) == (Purpose.WISH, True)
+    if not runs:
+        assert loads.spare(KEY, 100, "a", computed=False) is wish
+        assert (wish.work, wish.is_ahead) == (Purpose.SPARE, True)
+    elif loads.choose() is wish:
+        assert loads.start(wish, Attempt(0.0))
+    assert loads.want(KEY, 100, 3.0, "b") is wish
+    assert (wish.work, wish.is_ahead, wish.is_running) == (Purpose.DEMAND, False, runs)
+    assert loads.prefetch(KEY, 100, 5.0, computed=False) is wish
+    assert wish.work is Purpose.DEMAND
+
+
+def test_a_check_stays_one_when_its_cell_is_asked_for(loads: Loads) -> None:
+    resident = leftover()
+    loads.check_leftover(resident)
+    check = loads.by_key[KEY]
+    assert check.work == LeftoverCheck(resident, is_asked_for=False)
+    assert loads.want(KEY, 100, 3.0, "a") is check
+    assert (check.work, check.estimate, check.priority) == (LeftoverCheck(resident, True), 0, 3.0)
+    assert loads.is_promised(KEY)
+    loads.finish(check)
+    failed = loads.check_failed_file(KEY, 3.0, "a", bytes(24))
+    assert loads.want(KEY, 100, 2.0, "b") is failed
+    assert (failed.work, loads.is_promised(KEY)) == (FailedFileCheck(bytes(24)), False)
+
+
+@pytest.mark.parametrize("runs", [False, True])
+@pytest.mark.parametrize("is_wish", [False, True])
+def test_a_leftover_that_is_found_late_is_checked_instead_of_loaded(
+    loads: Loads, runs: bool, is_wish: bool
+) -> None:
+    """A page of the map had to come first; a load that runs already supersedes it."""
+    load = loads.prefetch(KEY, 100, 5.0, computed=False) if is_wish else loads.want(KEY, 100, 3.0, "a")
+    before = load.work
+    if runs and loads.choose() is load:
+        assert loads.start(load, Attempt(0.0))
+    resident = leftover()
+    loads.check_leftover(resident)
+    assert loads.by_key == {KEY: load}
+    assert load.work == (before if runs else LeftoverCheck(resident, is_asked_for=not is_wish))
+    assert load.estimate == (100 if runs else 0)

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from shmmap.daemon.cache.eviction_plan import HAND_OUT_GRACE_S
-from shmmap.daemon.loading.loads import PREFETCH
+from shmmap.daemon.loading.loads import PREFETCH, Attempt, Load, Purpose
 from shmmap.daemon.loading.look_ahead import IN_A_ROW, URGENT_S
 from shmmap.daemon.loading.prefetcher import FULL_S, KEPT, MAX_PATHS
-from shmmap.daemon.records import Key, Load
+from shmmap.daemon.records import Key
 from shmmap.daemon.transport.sessions import Session
 from shmmap.protocol.events import Loaded, Recent, decode_event
 from shmmap.protocol.messages import Area, CircleMessage, Intent, Selected
@@ -95,10 +95,11 @@ def test_loads_that_were_begun_in_an_outage_do_not_make_another_one(
     one.run_until(lambda: idle(one))
     prefetcher, now_s = one.scheduler.prefetcher, one.now_s()
     health = prefetcher.health
-    load = Load(Key("a", "points"), 0, 0.0, 1, sources=(bytes(24),))
+    load = Load(Key("a", "points"), 0, 0.0, 1)
 
     def end(after_s: float, took_s: float, out: bool) -> tuple[bool, int]:
-        prefetcher.ended.append((load, True, took_s, out))
+        load.attempt = Attempt(0.0, (bytes(24),), took_s=took_s)
+        prefetcher.note_end(load, out=out)
         prefetcher.run_step(now_s + after_s)
         return health.is_out, health.failed_in_a_row
 
@@ -183,9 +184,9 @@ def test_as_many_are_fetched_as_there_are_free_places(prefetching: Callable[...,
             drive.ask(-350.0, wait=0.0)
             one.turn()
         assert len(one.scheduler._jobs) == 2 * 8 - 8 // KEPT
-        assert all(load.prefetch for load in one.scheduler._jobs.values())
+        assert all(load.work is Purpose.WISH for load in one.scheduler._jobs.values())
         one.ask(one.session(), Selected(50, ("380_0.pcd",), wait=30.0))
-        one.run_until(lambda: any(not load.prefetch for load in one.scheduler._jobs.values()))
+        one.run_until(lambda: any(load.work is not Purpose.WISH for load in one.scheduler._jobs.values()))
     assert names(one.cells_of(50)) == ["380_0.pcd"]
     one.run_until(lambda: idle(one))
 
@@ -196,11 +197,13 @@ def test_what_is_asked_for_while_it_is_fetched_is_loaded_once(
     one = prefetching(workers=1)
     drive = Drive(one)
     with one.loaders_standing_still():
-        one.run_until(lambda: any(load.prefetch and load.running for load in one.loads.by_key.values()))
+        one.run_until(
+            lambda: any(load.work is Purpose.WISH and load.is_running for load in one.loads.by_key.values())
+        )
         (load,) = one.loads.by_key.values()
         other, started = one.session(), count(one, "loads_started")
         one.ask(other, Selected(50, (load.key.cell_id,), wait=30.0))
-        assert not load.prefetch
+        assert load.work is not Purpose.WISH
         assert count(one, "prefetch_overtaken") == 1
     assert len(names(one.cells_of(50))) == 1
     resident = one.ledger.by_key[load.key]

@@ -82,7 +82,7 @@ def test_nothing_is_prepared_while_anything_loads(inner: Inner, small_map: Divid
     one = inner(small_map.root, prepare=(LAYER,))
     with one.loaders_standing_still():
         one.ask(one.session(), Selected(1, ("0_0.pcd",), wait=60.0))
-        one.run_until(lambda: any(load.running for load in one.loads.by_key.values()))
+        one.run_until(lambda: any(load.is_running for load in one.loads.by_key.values()))
         before = progress(one)
         for _ in range(20):  # at most what was under way is finished
             one.turn()

@@ -40,7 +40,7 @@ def test_a_demand_begins_when_the_link_is_silent_or_has_room(waiting: InnerDaemo
     assert link is not None
     one.ask(one.session(), Selected(1, (CELL,), wait=30.0))
     one.turn()
-    assert not any(load.running for load in one.loads.by_key.values())
+    assert not any(load.is_running for load in one.loads.by_key.values())
     assert 0.0 < sleeps_s(one) <= STALLED_S
     link.end(OTHER)
     assert names(one.cells_of(1)) == [CELL]
@@ -64,7 +64,7 @@ def test_a_wish_waits_for_what_is_under_way(waiting: InnerDaemon) -> None:
     load = one.loads.prefetch(one.cache.key(0, LAYER), 4096, 5.0, computed=False)
     one.offset_s += 2 * STALLED_S
     one.turn()
-    assert not load.running
+    assert not load.is_running
     assert sleeps_s(one) > STALLED_S
     link.end(OTHER)
     one.run_until(lambda: not one.loads.by_key)

@@ -424,7 +424,19 @@ def test_changes_are_the_difference_of_both(served: Served, seed: int) -> None:
     nothing = old.changes_from(old)
     assert nothing.known
     assert not nothing
-    assert nothing.same_cells
+    assert nothing.same_numbers
+
+
+@pytest.mark.parametrize("dx", [0.5, SIDE])
+def test_a_cell_that_goes_to_another_shard_shifts_the_numbers_of_others(served: Served, dx: float) -> None:
+    content = [bytes([number]) * 32 for number in range(6)]
+    before = {f"{n}.pcd": ((40.0 * n, 0.0, 40.0 * n + 10, 10.0), content[n]) for n in range(6)}
+    moved = {"0.pcd": ((dx, 0.0, dx + 10, 10.0), content[0])}
+    old = served.whole(publish(served.store, before))
+    new = served.whole(publish(served.store, {**before, **moved}))
+    change = new.changes_from(old)
+    assert (change.ids("moved"), change.count) == (("/map/0.pcd",), 1)
+    assert change.same_numbers == (dx == 0.5) == all(old.find(name) == new.find(name) for name in before)
 
 
 def test_changes_are_known_only_where_both_are(served: Served) -> None:
@@ -440,7 +452,7 @@ def test_changes_are_known_only_where_both_are(served: Served) -> None:
     new.pages.drop(other)
     old.pages.drop(other)
     change = new.changes_from(old)
-    assert (change.known, change.same_cells, change.ids("changed")) == (True, True, (f"/map/{name}",))
+    assert (change.known, change.same_numbers, change.ids("changed")) == (True, True, (f"/map/{name}",))
     new.pages.drop(page)
     assert not new.changes_from(old).known
     assert new.pages.lacking(old.pages) == [page]

@@ -87,19 +87,19 @@ def test_nearest_cells_first(inner: Inner, small_map: DividedMap) -> None:
     session = one.session()
     with one.loaders_standing_still():
         one.ask(session, Area(1, EVERYWHERE))
-        nearest = one.loads.next_queued()
+        nearest = one.loads.choose()
     assert nearest is not None
     assert Path(nearest.key.cell_id).name == "-20_-20.pcd"  # of the four that touch the middle
     two = inner(small_map.root)
     two.ask(two.session(), Area(1, CircleMessage(35, 35, 300)))
-    nearest = two.loads.next_queued()
+    nearest = two.loads.choose()
     assert nearest is not None
     assert Path(nearest.key.cell_id).name == "20_20.pcd"
     two = inner(small_map.root)
     session = two.session()
     session.intent, session.says_where = Intent(-35.0, 35.0), True
     two.ask(session, Area(1, CircleMessage(35, 35, 300)))
-    nearest = two.loads.next_queued()
+    nearest = two.loads.choose()
     assert nearest is not None
     assert Path(nearest.key.cell_id).name == "-40_20.pcd"
 

@@ -119,6 +119,38 @@ def test_a_map_switched_back_by_its_symlink(inner: Inner, small_map: DividedMap,
     assert one.statistics.values["loads_started"] == 16
 
 
+@pytest.mark.parametrize("what", ["rewritten", "moved", "removed", "all"])
+def test_a_reload_checks_the_segments_of_what_changed(inner: Inner, small_map: DividedMap, what: str) -> None:
+    """Segments are warm exactly if they are current, also where a layer reads the cells around."""
+    layers = ("points", "denoise(neighbors=5,halo=1.0)")
+    one = inner(small_map.root)
+    everything = Area(1, EVERYWHERE, layers, wait=600.0)
+    assert len(one.cells_for(everything).cells) == 32
+    if what == "removed":
+        small_map.remove_cell("0_0.pcd")
+    elif what == "moved":  # to another neighbour
+        small_map.corners["0_0.pcd"] = (-60, -60)
+    else:
+        for name in list(small_map.corners) if what == "all" else ["0_0.pcd"]:
+            rewrite(small_map, name, 33)
+    small_map.write_metadata()
+    one.reload()
+    assert one.cache.unentered == (32 if what in ("removed", "all") else 2)
+    while one.map_switch.busy:
+        one.map_switch.run_step(one.now_s())
+    residents = list(one.ledger.residents())
+    warm = {resident for table in one.cache.warm.layers.values() for resident in table.values()}
+    assert warm == {resident for resident in residents if one.cache.is_current(resident)}
+    # of the 16 denoised ones, 9 around the old place are not, nor 1 at the new one
+    assert len(warm) == {"rewritten": 15 + 7, "moved": 15 + 6, "removed": 15 + 7, "all": 0}[what]
+    for index in range(len(one.cache.catalogue)):
+        points = one.cache.warm.get(index, "points")
+        assert (one.cache.heights.get(index) is None) == (points is None)
+    again = one.cells_for(Area(2, EVERYWHERE, layers, wait=600.0))
+    assert not any(cell.stale for cell in again.cells)
+    assert len(one.cache.warm) == len(again.cells) == 32 - 2 * (what == "removed")
+
+
 def test_a_map_that_comes_and_goes(inner: Inner, small_map: DividedMap, tmp_path: Path) -> None:
     """Two states in turn, a reader of the first all the time: each time exactly the state's versions."""
     other = tmp_path / "other"

@@ -1,2 +1,0 @@
-# SPDX-License-Identifier: Apache-2.0
-"""Decide which chunks of a live map are in memory; `shmmap.daemon.live.paged_map` carries that out."""
