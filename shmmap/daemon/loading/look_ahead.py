@@ -98,7 +98,7 @@ class OriginHealth:
         return again
 
 
-PASS_S: Final = 0.5
+PASS_S: Final = 1.0
 """Shortest interval at which all paths are looked along."""
 STEP_S: Final = 0.002
 """... for each step: it takes a twentieth of that."""
