@@ -27,6 +27,7 @@ from shmmap.daemon.cache.eviction_plan import (
 )
 from shmmap.daemon.cache.reclaimer import Reclaimer
 from shmmap.daemon.records import Resident
+from shmmap.daemon.travel.places import NOWHERE, Places
 from shmmap.large_tables import ShardedDict
 
 PREFETCHED_PER_TURN: Final = 64
@@ -70,6 +71,8 @@ class Evictor:
     _next: EvictionPlan = field(default_factory=EvictionPlan)
     _making: Iterator[None] | None = None  # of the next plan
     _stepped_s: float = -math.inf
+    _placed: tuple[Places, int] = (NOWHERE, -1)
+    _placed_s: float = -math.inf
     _pressure_until_s: float = -math.inf
 
     def free(self, shortage: int, now_s: float, *, rather_than: Resident | None = None) -> Freeing:
@@ -125,7 +128,8 @@ class Evictor:
         for resident in some:  # move them to the end
             del ledger.prefetched[resident]
             ledger.prefetched[resident] = None
-        least, *scores = eviction_scores([wished, *some], self.reclaimer.sessions.places(), now_s).tolist()
+        places, _version = self._positions(now_s)
+        least, *scores = eviction_scores([wished, *some], places, now_s).tolist()
         later = sorted((its, number) for number, its in enumerate(scores) if its > least)
         work = LOOKS_PER_CALL
         while later and shortage > 0 and work:
@@ -176,13 +180,20 @@ class Evictor:
     def run_step(self, now_s: float) -> None:
         """Make a part of the next plan; once it is made, it takes the place of the present one."""
         self._stepped_s = now_s
-        ledger, sessions = self.reclaimer.ledger, self.reclaimer.sessions
+        ledger = self.reclaimer.ledger
         if self._making is None:
             ledger.evictable.new = ShardedDict()
-            self._next = EvictionPlan(sessions.places(), sessions.places_version, now_s)
+            self._next = EvictionPlan(*self._positions(now_s), now_s)
             self._making = self._next.make(ledger.segments.walk(), lambda one: self._may_go(one, now_s))
         if next(self._making, self) is self:
             self._plan, self._making = self._next, None
+
+    def _positions(self, now_s: float) -> tuple[Places, int]:
+        """Return positions of clients and their version, at most `PLAN_S` old: merging them takes long."""
+        sessions = self.reclaimer.sessions
+        if sessions.places_version != self._placed[1] and now_s >= self._placed_s + PLAN_S:
+            self._placed_s, self._placed = now_s, (sessions.places(), sessions.places_version)
+        return self._placed
 
     @property
     def _will_be_needed(self) -> bool:
