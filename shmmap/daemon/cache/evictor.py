@@ -38,7 +38,7 @@ FREE_SHARE: Final = 8
 """Divisor: the first plan is made when less than 1/8 of the budget is free."""
 PLAN_S: Final = 0.25
 """Shortest interval of plans that no load waits for."""
-STEP_S: Final = 0.004
+STEP_S: Final = 0.008
 """Interval of their steps: they take a twentieth of a core at most."""
 LOOKS_PER_CALL: Final = 4
 """Segments looked at by one `Evictor.free`: a look takes 15 us, and retiring one is as much work again."""
