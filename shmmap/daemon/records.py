@@ -34,7 +34,6 @@ class Resident:
     client asks for it, ``spare`` for one that was loaded into spare memory and only spare requests asked for.
     ``handle`` and ``stale_handle`` are encoded once for all replies.  ``sessions`` are
     the slots of the sessions that hold it.  ``place`` is its position among all segments of its size.
-    ``deferred_s`` is how long it was deferred when it was last found in use.
     """
 
     name: str
@@ -55,7 +54,6 @@ class Resident:
     spare: bool = False
     sessions: set[int] = field(default_factory=set)
     place: int = -1
-    deferred_s: float = 0.0
 
 
 @dataclass(slots=True, eq=False)

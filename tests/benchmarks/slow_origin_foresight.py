@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.daemon.loading.look_ahead import OriginHealth, Prefetch, Wish
+from shmmap.daemon.loading.look_ahead import OriginHealth, Prefetch, Reader, Wish
 from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.travel.motion import Motion
 from shmmap.geometry import Circle
@@ -90,7 +90,8 @@ class Truth(Nothing):
     ) -> None:
         super().__init__()
         self._is_absent = is_absent
-        self._policy = Prefetch(is_absent, outage_tolerance_s, self.health)
+        self._policy = Prefetch(is_absent, outage_tolerance_s)
+        self._policy.health = self.health
         self._times_s, self._cells = future
 
     def next(self, catalogue: CatalogueView, now_s: float) -> Wish | None:
@@ -115,7 +116,8 @@ class Policy(Nothing):
 
     def __init__(self, is_absent: IsAbsent, outage_tolerance_s: float, motion: Motion, area: Circle) -> None:
         super().__init__()
-        self._prefetch = Prefetch(is_absent, outage_tolerance_s, self.health)
+        self._prefetch, self._reader = Prefetch(is_absent, outage_tolerance_s), Reader(is_absent)
+        self._prefetch.health = self.health
         self._motion = motion
         self.asks(area)
 
@@ -129,10 +131,10 @@ class Policy(Nothing):
 
     def next(self, catalogue: CatalogueView, now_s: float) -> Wish | None:
         """Return what the daemon would fetch next."""
-        wish = self._prefetch.next(catalogue, now_s)
-        self.more = self._prefetch.more
+        wish = self._prefetch.next(catalogue, now_s, self._reader)
+        self.more = self._prefetch.next_s(now_s, self._reader) <= now_s
         return wish
 
     def next_s(self, now_s: float) -> float:
         """When the daemon would look again."""
-        return self._prefetch.next_s(now_s)
+        return self._prefetch.next_s(now_s, self._reader)

@@ -21,9 +21,10 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from shmmap.daemon.cache.evictor import Evictor
+from shmmap.daemon.cache.eviction_plan import HAND_OUT_GRACE_S
+from shmmap.daemon.cache.evictor import Evictor, Freeing
 from shmmap.daemon.cache.ledger import Ledger
-from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S, Reclaimer
+from shmmap.daemon.cache.reclaimer import Reclaimer
 from shmmap.daemon.loading.loads import Attempt, Load, Loads
 from shmmap.daemon.pins.watch import PinWatch
 from shmmap.daemon.records import Failure, Key, Resident
@@ -370,9 +371,9 @@ class Machine(RuleBasedStateMachine):
             if shortage <= 0:
                 assert pages <= room
                 return
-            will_come = self.evictor.free(shortage, self.now_s)
+            freeing = self.evictor.free(shortage, self.now_s)
             self.follow()
-            if not will_come:
+            if freeing is Freeing.NO_MORE:
                 assert pages > room
                 return
             self.wait_for_the_other_thread()
@@ -406,7 +407,7 @@ class Machine(RuleBasedStateMachine):
         everything = [*ledger.residents(), *(retired.resident for retired in ledger.retired.values())]
         assert len(ledger.segments) == len(everything)
         assert set(ledger.segments.walk()) == set(everything)
-        assert len(ledger.order) == ledger.resident_count
+        assert all(ledger.resident_named(one.name) is one for one in ledger.evictable.new)
         assert ledger.reserved_bytes == sum(w.reserved for w in self.loads.values())
         parts = ledger.resident_bytes + ledger.retired_bytes + ledger.reserved_bytes + ledger.overhead_bytes
         assert ledger.used_bytes == parts <= ledger.budget_bytes

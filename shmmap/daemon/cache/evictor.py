@@ -1,82 +1,60 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Eviction: retires the segments that clients will need last, except those that a process has mapped.
+"""Which segment goes next, and when there is room: retires the segments that clients will need last.
 
-One turn of the serving loop handles a bounded number of segments; the others follow in later turns.
+A plan (`shmmap.daemon.cache.eviction_plan`) lists them.  When its turn comes, a segment goes if it is still
+in service, no request or pin needs it, and no process uses it.  The segments that were just handed out come
+last: a load waits for the end of their grace if no process has opened them by then.  When none is left, those
+that have come into question since are listed.  One turn of the serving loop handles a bounded number of
+segments; the others follow in later turns.
 """
 
 from __future__ import annotations
 
+import enum
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import islice
 from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
-from shmmap.daemon.cache.eviction_order import BATCH, Score
-from shmmap.daemon.cache.reclaimer import (
+from shmmap.daemon.cache.eviction_plan import (
+    BLOCK,
     HAND_OUT_GRACE_S,
-    LOOKS_PER_TURN,
-    SHARE_S,
-    WATCHED_INTERVAL_S,
-    Reclaimer,
+    MAX_LISTED,
+    Candidate,
+    EvictionPlan,
+    eviction_scores,
 )
+from shmmap.daemon.cache.reclaimer import Reclaimer
 from shmmap.daemon.records import Resident
-from shmmap.daemon.travel.places import NOWHERE, Places, until_needed
+from shmmap.daemon.travel.places import NOWHERE, Places
+from shmmap.large_tables import ShardedDict
 
-PIN_MEMO_S: Final = 0.2
-"""How long, at least, a segment found pinned is not considered again.  The time grows with each try if the
-kernel reports when a process closes the segment."""
 PREFETCHED_PER_TURN: Final = 64
 """Prefetched segments compared with a wish at a time: a tenth of a millisecond."""
 PRESSURE_S: Final = 10.0
-"""How long scores are kept up to date after memory was short."""
-REFRESH_S: Final = 0.004
-"""How often a few scores are updated."""
-ROUND_S: Final = 2.0
-"""Minimum interval of rounds that update the scores of all segments, a few at a time."""
-WORK_PER_TURN: Final = 4
-"""Segments handled by one `free`: checking one takes 15 us, and retiring one is as much work again."""
-PLACES_S: Final = 0.25
-"""How often the positions of moving clients are updated."""
-MAX_SCORE: Final = 1e12
-"""Score of what will never be needed; finite, so that scores can be compared."""
-SPARE_SCORE: Final = 1e15
-"""Added to the score of what was loaded into spare memory."""
-SOON_S: Final = 30.0
-"""Added to the time until a segment is needed; without it, size would not matter for those needed soon."""
+"""How long plans are made after memory was short.  A load helps to replace an outdated plan that is older."""
+FREE_SHARE: Final = 8
+"""Divisor: the first plan is made when less than 1/8 of the budget is free."""
+PLAN_S: Final = 0.25
+"""Shortest interval of plans that no load waits for."""
+STEP_S: Final = 0.008
+"""Interval of their steps: they take a twentieth of a core at most."""
+LOOKS_PER_CALL: Final = 4
+"""Segments looked at by one `Evictor.free`: a look takes 15 us, and retiring one is as much work again."""
 
 
-def eviction_scores(candidates: Sequence[Resident], places: Places, now_s: float) -> NDArray[np.float64]:
-    """Score segments, (N,): the highest is evicted first; among equals, the one unused for longest.
+class Freeing(enum.Enum):
+    """What an attempt to free memory has come to."""
 
-    The score is the time until a segment is needed (s), weighted by the square root of its size: of the
-    exponents tried, this one saved most bytes of loading where sizes differ.  Without any place the least
-    recently used segment is evicted first.  Requested, prefetched and computed segments are scored alike;
-    what was loaded into spare memory goes before all others.
-
-    Parameters
-    ----------
-    places
-        Present and future positions of the clients.
-    """
-    spare = SPARE_SCORE * np.array([resident.spare for resident in candidates], dtype=np.float64)
-    if not len(places):
-        return spare - np.array([resident.last_use_s for resident in candidates], dtype=np.float64)
-    boxes = np.array([resident.box for resident in candidates]).reshape(-1, 4)
-    sizes = np.array([resident.nbytes for resident in candidates], dtype=np.float64)
-    scores: NDArray[np.float64] = (until_needed(boxes, places, now_s) + SOON_S) * np.sqrt(sizes)
-    return np.minimum(scores, MAX_SCORE) + spare
-
-
-_UNTIL_CLIENTS_MOVE: Final = Score(lambda some: eviction_scores(some, NOWHERE, 0.0))
+    ENOUGH = "enough memory is about to be free"
+    LATER = "another attempt is worth it, at `Evictor.wake_s`"
+    NO_MORE = "all other segments are in use, or needed"
 
 
 @dataclass(eq=False, slots=True)
 class Evictor:
-    """Retires segments in the eviction order, and keeps that order up to date.
+    """Retires the segments that a plan lists, and makes plans.
 
     Attributes
     ----------
@@ -89,21 +67,16 @@ class Evictor:
     reclaimer: Reclaimer
     evicted_count: int = 0
     wake_s: float = math.inf
-    # count of changes after which nothing could be freed, until when that holds, and when to try again
-    _waits: tuple[int, float, float] = (-1, -math.inf, -math.inf)
-    _score: Score = _UNTIL_CLIENTS_MOVE
-    _round: Iterator[Resident] = field(default_factory=lambda: iter(()))
-    _round_version: int = 0
-    _round_s: float = -math.inf
+    _plan: EvictionPlan = field(default_factory=lambda: EvictionPlan(is_whole=False))
+    _next: EvictionPlan = field(default_factory=EvictionPlan)
+    _making: Iterator[None] | None = None  # of the next plan
+    _stepped_s: float = -math.inf
+    _placed: tuple[Places, int] = (NOWHERE, -1)
     _placed_s: float = -math.inf
-    _refreshed_s: float = -math.inf
-    _refresh_until_s: float = -math.inf
-    _new_ones: bool = False
+    _pressure_until_s: float = -math.inf
 
-    def free(self, shortage: int, now_s: float, *, rather_than: Resident | None = None) -> bool:
-        """Retire segments until ``shortage`` bytes are about to be freed; return False if the rest is in use.
-
-        True may also mean that calling again at ``wake_s`` helps.
+    def free(self, shortage: int, now_s: float, *, rather_than: Resident | None = None) -> Freeing:
+        """Retire a segment, or look at a few, unless ``shortage`` bytes are about to be free.
 
         Parameters
         ----------
@@ -112,48 +85,36 @@ class Evictor:
         """
         ledger = self.reclaimer.ledger
         self.wake_s = math.inf
-        missing = shortage - ledger.coming_bytes
-        if missing <= 0:
-            return True
-        self._refresh_until_s = now_s + PRESSURE_S
-        order, work = ledger.order, 0
-        if rather_than is None and order.changes == self._waits[0] and now_s < self._waits[1]:
-            self.wake_s = self._waits[2]
-            return True
-        score = self._scored(now_s, 4.0 * PLACES_S)  # normally `run_step` keeps them up to date
-        if order.fill(score, now_s):
-            self.wake_s = now_s
-            return True
-        first = order.front(score)
-        if first is None:
-            self.wake_s = now_s
-            return True
-        if rather_than is not None:
-            least, *scores = score.of([rather_than, *first])
-            first = [resident for resident, its in zip(first, scores, strict=True) if its > least]
-        for resident in first:
-            graced_s = resident.last_use_s + HAND_OUT_GRACE_S
-            if ledger.is_needed(resident.key):
-                order.defer(resident, order.deferred, math.inf)
-            elif graced_s > now_s:
-                order.defer(resident, order.in_grace, graced_s)
-            elif work >= WORK_PER_TURN:
-                break
-            elif self._found_in_use(resident, now_s):
-                work += 1
-            else:
-                work = WORK_PER_TURN
-                missing -= resident.nbytes
-                self.reclaimer.retire(resident, now_s, "room")
-                self.evicted_count += 1
-                if missing <= 0:
-                    return True
-        if first:
-            self.wake_s = now_s
-            return True
-        if rather_than is not None:
-            return ledger.coming_bytes >= shortage
-        return self._is_any_soon_free(now_s) or ledger.coming_bytes >= shortage
+        if shortage <= ledger.coming_bytes:
+            return Freeing.ENOUGH
+        self._pressure_until_s = now_s + PRESSURE_S
+        ledger.evictable.look_again(now_s)
+        if self._plan.listed and now_s >= self._plan.now_s + PRESSURE_S and self._is_outdated:
+            self.run_step(now_s)
+        for _ in range(LOOKS_PER_CALL):
+            first = self._first(now_s)
+            if first is None or not first.is_past_grace:
+                if self._list_more(now_s):
+                    break
+                if first is None:
+                    return Freeing.NO_MORE
+            resident, graced_s = first.resident, first.resident.last_use_s + HAND_OUT_GRACE_S
+            if rather_than is not None and not (
+                first.is_past_grace and first.score > self._plan.score(rather_than)
+            ):
+                return Freeing.NO_MORE
+            if self._is_in_use(resident, now_s):
+                continue
+            if graced_s > now_s:  # all others are in use
+                self.wake_s = graced_s
+                return Freeing.LATER
+            self.reclaimer.retire(resident, now_s, "room")
+            self.evicted_count += 1
+            if shortage <= ledger.coming_bytes:
+                return Freeing.ENOUGH
+            break
+        self.wake_s = now_s
+        return Freeing.LATER
 
     def give_up_prefetched(self, shortage: int, now_s: float, wished: Resident) -> bool:
         """Retire prefetched segments that no client has asked for and that are needed later than ``wished``.
@@ -167,77 +128,94 @@ class Evictor:
         for resident in some:  # move them to the end
             del ledger.prefetched[resident]
             ledger.prefetched[resident] = None
-        least, *scores = self._scored(now_s, 4.0 * PLACES_S).of([wished, *some])
+        places, _version = self._positions(now_s)
+        least, *scores = eviction_scores([wished, *some], places, now_s).tolist()
         later = sorted((its, number) for number, its in enumerate(scores) if its > least)
-        work = WORK_PER_TURN
+        work = LOOKS_PER_CALL
         while later and shortage > 0 and work:
             resident = some[later.pop()[1]]
             self.reclaimer.retire(resident, now_s, "room")
             self.evicted_count += 1
             shortage -= resident.nbytes
             work -= 1
-        return work < WORK_PER_TURN
+        return work < LOOKS_PER_CALL
 
-    def _is_any_soon_free(self, now_s: float) -> bool:
-        """Whether a grace period is worth waiting for: no process has opened that segment yet."""
+    def _first(self, now_s: float) -> Candidate | None:
+        """Return the candidate that goes first; those that may not go any more are dropped."""
+        while (first := self._plan.first()) is not None and not self._may_go(first.resident, now_s):
+            self._plan.listed.pop()
+        return first
+
+    def _may_go(self, resident: Resident, now_s: float) -> bool:
+        """Whether a segment is in service, not needed, and was not found in use a moment ago."""
         ledger = self.reclaimer.ledger
-        order = ledger.order
-        for _ in range(LOOKS_PER_TURN):
-            soon = order.in_grace.first()
-            if soon is None:
-                return False
-            until_s, resident = soon
-            if resident not in order.in_grace:
-                continue
-            if ledger.is_needed(resident.key):
-                order.defer(resident, order.deferred, math.inf)
-            elif not self._found_in_use(resident, now_s):
-                deferred = order.deferred.first()
-                first_s = min(until_s, deferred[0]) if deferred is not None else until_s
-                self._waits = order.changes, first_s, until_s
-                self.wake_s = until_s
-                return True
-        self.wake_s = now_s
-        return True
+        return (
+            ledger.resident_named(resident.name) is resident
+            and not ledger.is_needed(resident.key)
+            and not ledger.evictable.is_left_alone(resident, now_s)
+        )
 
-    def _found_in_use(self, resident: Resident, now_s: float) -> bool:
-        """Whether a process has a segment mapped; if so, defer it."""
+    def _is_in_use(self, resident: Resident, now_s: float) -> bool:
+        """Whether a process has a segment mapped; if so, leave it alone for a while."""
         if not self.reclaimer.is_pinned(resident):
             return False
-        order = self.reclaimer.ledger.order
-        longer_s = 2.0 * resident.deferred_s if self.reclaimer.pins.watch_next_close(resident.name) else 0.0
-        resident.deferred_s = min(max(PIN_MEMO_S, longer_s), WATCHED_INTERVAL_S)
-        order.defer(resident, order.deferred, now_s + max(resident.deferred_s, SHARE_S * len(order.deferred)))
+        is_watched = self.reclaimer.pins.watch_next_close(resident.name)
+        self.reclaimer.ledger.evictable.found_in_use(resident, now_s, is_watched=is_watched)
         return True
 
-    # --- keeping the order up to date -----------------------------------------------------------
+    # --- plans ------------------------------------------------------------------------------------
 
     @property
     def next_s(self) -> float:
-        """When `run_step` has something to do; for a while after memory was short."""
-        return self._refreshed_s + REFRESH_S if self._refreshed_s < self._refresh_until_s else math.inf
+        """When `run_step` has something to do: if anything changed, for a while after memory was short.
+
+        The first plan is made before.
+        """
+        if self._stepped_s >= self._pressure_until_s and not self._will_be_needed:
+            return math.inf
+        if self._making is not None:
+            return self._stepped_s + STEP_S
+        return max(self._stepped_s + STEP_S, self._plan.now_s + PLAN_S) if self._is_outdated else math.inf
 
     def run_step(self, now_s: float) -> None:
-        """Score some new segments, or update some scores, alternately."""
-        self._refreshed_s = now_s
-        ledger, before = self.reclaimer.ledger, self._score
-        score = self._scored(now_s, PLACES_S)
-        if score is not before:
-            return  # enough for this turn
-        self._new_ones = not self._new_ones
-        if self._new_ones:
-            ledger.order.score_new(score)
-        elif some := list(islice(self._round, BATCH)):
-            ledger.order.refresh(some, score)
-        elif self._round_version != score.version and now_s - self._round_s >= ROUND_S:
-            self._round_s = now_s
-            self._round, self._round_version = ledger.segments.walk(), score.version
+        """Make a part of the next plan; once it is made, it takes the place of the present one."""
+        self._stepped_s = now_s
+        ledger = self.reclaimer.ledger
+        if self._making is None:
+            ledger.evictable.new = ShardedDict()
+            self._next = EvictionPlan(*self._positions(now_s), now_s)
+            self._making = self._next.make(ledger.segments.walk(), lambda one: self._may_go(one, now_s))
+        if next(self._making, self) is self:
+            self._plan, self._making = self._next, None
 
-    def _scored(self, now_s: float, age_s: float) -> Score:
-        """Return how segments are scored, by client positions that are at most ``age_s`` old."""
+    def _positions(self, now_s: float) -> tuple[Places, int]:
+        """Return positions of clients and their version, at most `PLAN_S` old: merging them takes long."""
         sessions = self.reclaimer.sessions
-        if sessions.places_version != self._score.version and now_s - self._placed_s >= age_s:
-            self._placed_s = now_s
-            places = sessions.places()
-            self._score = Score(lambda some: eviction_scores(some, places, now_s), sessions.places_version)
-        return self._score
+        if sessions.places_version != self._placed[1] and now_s >= self._placed_s + PLAN_S:
+            self._placed_s, self._placed = now_s, (sessions.places(), sessions.places_version)
+        return self._placed
+
+    @property
+    def _will_be_needed(self) -> bool:
+        """Whether there is no plan yet, and memory will soon be short."""
+        ledger = self.reclaimer.ledger
+        return self._plan.now_s == -math.inf and ledger.shortage(ledger.budget_bytes // FREE_SHARE) > 0
+
+    @property
+    def _is_outdated(self) -> bool:
+        """Whether another plan would list other segments."""
+        plan, reclaimer = self._plan, self.reclaimer
+        have_clients_moved = reclaimer.sessions.places_version != plan.places_version
+        is_short = not plan.is_whole and len(plan.listed) < MAX_LISTED // 2
+        return have_clients_moved or is_short or bool(reclaimer.ledger.evictable.new)
+
+    def _list_more(self, now_s: float) -> bool:
+        """List what has come into question since, or make a part of the next plan; False if none is left."""
+        plan, evictable = self._plan, self.reclaimer.ledger.evictable
+        too_many = max(len(evictable.new), len(plan.listed) - MAX_LISTED) > BLOCK
+        if self._making is None and not too_many and (plan.is_whole or plan.listed):
+            some = [evictable.new.popitem()[0] for _ in range(len(evictable.new))]
+            plan.add([resident for resident in some if self._may_go(resident, now_s)])
+            return bool(some)
+        self.run_step(now_s)
+        return True

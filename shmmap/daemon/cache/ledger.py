@@ -10,15 +10,24 @@ Times are seconds on any one clock, injected by the caller.
 
 from __future__ import annotations
 
+import heapq
+import math
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from typing import Final
+from typing import Any, Final
 
-from shmmap.daemon.cache.eviction_order import EvictionOrder
 from shmmap.daemon.records import Key, Resident, Retired
 from shmmap.large_tables import ShardedDict
 
 _PLACES: Final = 1 << 32
+DUE_PER_CALL: Final = 16
+IN_USE_S: Final = 0.2
+"""How long, at least, a segment found in use is left alone.  The time doubles with each look if the kernel
+reports when a process closes the segment."""
+MAX_IN_USE_S: Final = 5.0
+"""... and how long at most: a precaution."""
+SHARE_S: Final = 0.0005
+"""Minimum time between two looks when very many segments are mapped (a look takes 15 us)."""
 
 
 class Segments:
@@ -76,6 +85,77 @@ class Segments:
         return found, None
 
 
+class Evictable:
+    """What has changed about which residents can be evicted.
+
+    Attributes
+    ----------
+    new : ShardedDict
+        Segments that entered service or were released since the last plan was begun.
+    changes : int
+        How often that happened.
+    """
+
+    def __init__(self) -> None:
+        self.changes = 0
+        self.new: ShardedDict[Resident, object] = ShardedDict()
+        self._in_use: ShardedDict[Resident, Any] = ShardedDict()  # until when it is left alone, and how long
+        self._heap: list[tuple[float, int, Resident]] = []
+        self._number = 0
+
+    def add(self, resident: Resident) -> None:
+        """Note that a segment entered service, or that a request or pin needs it no more."""
+        self.new[resident] = None
+        self.changes += 1
+
+    def leave(self, resident: Resident) -> None:
+        """Forget a segment that left service."""
+        self.new.pop(resident, None)
+        self._in_use.pop(resident, None)
+
+    def release(self, resident: Resident) -> bool:
+        """Note that a user has released a segment; return whether it had been found in use."""
+        was_in_use = self._in_use.pop(resident, None) is not None
+        self.add(resident)
+        return was_in_use
+
+    def release_all(self) -> None:
+        """Note that any segment that was found in use may have been released."""
+        few, many = self.new, self._in_use
+        if len(few) > len(many):
+            few, many = many, few
+        many.update(few)  # the smaller table is merged into the larger one
+        self.new, self._in_use, self._heap = many, ShardedDict(), []
+        self.changes += 1
+
+    def found_in_use(self, resident: Resident, now_s: float, *, is_watched: bool) -> None:
+        """Leave a segment alone for a while; ``is_watched``: the kernel reports its next close."""
+        last_s = self._in_use.get(resident, (0.0, 0.0))[1]
+        for_s = min(max(IN_USE_S, 2.0 * last_s * is_watched), MAX_IN_USE_S)
+        until_s = now_s + max(for_s, SHARE_S * len(self._in_use))
+        self._in_use[resident] = until_s, for_s
+        self._number += 1
+        heapq.heappush(self._heap, (until_s, self._number, resident))
+
+    def is_left_alone(self, resident: Resident, now_s: float) -> bool:
+        """Whether a segment was found in use a moment ago."""
+        known = self._in_use.get(resident)
+        return known is not None and now_s < known[0]
+
+    def next_look_s(self) -> float:
+        """Return when the first of the segments found in use is looked at again, at the earliest."""
+        return self._heap[0][0] if self._heap else math.inf
+
+    def look_again(self, now_s: float) -> None:
+        """Consider some of the segments again that have been left alone for long enough."""
+        for _ in range(DUE_PER_CALL):
+            if self.next_look_s() > now_s:
+                break
+            until_s, _, resident = heapq.heappop(self._heap)
+            if self._in_use.get(resident, (0.0, 0.0))[0] == until_s:
+                self.new[resident] = None
+
+
 class Ledger:
     """Memory accounting of one daemon.
 
@@ -92,8 +172,8 @@ class Ledger:
         Segments out of service, by their original name.
     segments
         All segments in memory, retired ones included.
-    order
-        Order in which residents are evicted.
+    evictable
+        What has changed about which residents can be evicted.
     retired_bytes, freeing_bytes
         Memory of retired segments, and the part of it that the kernel is taking back now.
     unopened_bytes
@@ -114,7 +194,7 @@ class Ledger:
         self.retired: dict[str, Retired] = {}
         self.resident_bytes = 0
         self.segments = Segments()
-        self.order = EvictionOrder()
+        self.evictable = Evictable()
         self.retired_bytes = 0
         self.freeing_bytes = 0
         self.unopened_bytes = 0
@@ -194,7 +274,7 @@ class Ledger:
         if count:
             self._needed[key] = count
         elif key in self.by_key:
-            self.order.reconsider(self.by_key[key])
+            self.evictable.add(self.by_key[key])
 
     def needed(self) -> Iterable[Key]:
         """Return the keys that requests or pins need."""
@@ -217,8 +297,7 @@ class Ledger:
             self.prefetched[resident] = None
             self.prefetched_bytes += resident.nbytes
         self.segments.add(resident)
-        self.order.new[resident] = None
-        self.order.changes += 1
+        self.evictable.add(resident)
         if old is not None:
             self._leave_service(old)
         return old
@@ -248,7 +327,7 @@ class Ledger:
         self.unchecked_count -= not resident.checked
         self._not_ahead(resident)
         self.resident_bytes -= resident.nbytes
-        self.order.leave(resident)
+        self.evictable.leave(resident)
         self.retired_bytes += resident.nbytes
         self.retired[resident.name] = Retired(resident)
 

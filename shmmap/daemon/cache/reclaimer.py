@@ -23,7 +23,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Final, Protocol
 
-from shmmap.daemon.cache.ledger import Ledger
+from shmmap.daemon.cache.ledger import SHARE_S, Ledger
 from shmmap.daemon.pins.probe import PinSource
 from shmmap.daemon.pins.watch import PinWatch
 from shmmap.daemon.records import Key, Resident, Retired
@@ -113,10 +113,6 @@ WATCHED_INTERVAL_S: Final = 5.0
 A report arrives a moment before the close takes effect, so the first checks after a report follow each other
 quickly.
 """
-SHARE_S: Final = 0.0005
-"""Minimum time between two checks when very many segments are mapped (a check takes 15 us)."""
-HAND_OUT_GRACE_S: Final = 1.0
-"""A segment that was just handed out is not evicted for this long, so that its reader can open it."""
 LOOKS_PER_TURN: Final = 8
 """Segments checked, retired or freed per turn: a check takes 15 us, retiring one 50 us."""
 DROPPED_PER_LOOK: Final = 64
@@ -328,7 +324,7 @@ class Reclaimer:
         for resident in residents:
             retired = self.ledger.retired.get(resident.name)
             if retired is None:
-                self.ledger.order.reconsider(resident)
+                self.ledger.evictable.release(resident)
             elif retired.probe_after_s > now_s and not retired.unopened:
                 self._look_at(retired, now_s)
 
@@ -379,7 +375,7 @@ class Reclaimer:
         """Schedule a check of segments that processes have closed; return whether more may fit now."""
         names = self.pins.closed()
         if names is None:
-            self.ledger.order.reconsider_all()
+            self.ledger.evictable.release_all()
             self._to_check = Walk(self.ledger.segments.walk())
             return True
         changed = False
@@ -391,7 +387,7 @@ class Reclaimer:
                 if not retired.unopened:
                     self._look_at(retired, now_s)
             elif resident is not None:
-                changed |= self.ledger.order.reconsider(resident)
+                changed |= self.ledger.evictable.release(resident)
         return changed
 
     # --- the end --------------------------------------------------------------------------------

@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
-from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S
+from shmmap.daemon.cache.eviction_plan import HAND_OUT_GRACE_S
 from shmmap.daemon.loading.loads import BACKGROUND, Loads
 from shmmap.daemon.loading.scheduler import MisplacedCells
 from shmmap.daemon.records import Key, Resident

@@ -1,25 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Choice of the cell to prefetch next: on all clients' paths, the one needed first; without any I/O.
+"""Which cell is fetched next: on all clients' paths, the one needed first; without any I/O.
 
 The area that a client asks for is moved along its path in steps: cells that enter it at a step are needed
 when the client arrives there.  The path is the route that the client sent.  Without a route, and beyond its
 end, the path continues straight ahead and, a little later, to both sides, because the client may turn; the
-longer the client has moved straight ahead, the farther.  Cells needed along a kilometre are not stored: the
-path is examined repeatedly (a *pass*), and absent cells become wishes.  So no wish is ever outdated, whatever
-moves, changes or is evicted in the meantime.
+longer the client has moved straight ahead, the farther.  All paths are looked along again and again, a few
+steps at a time, and what is missing is listed in the order in which it is needed.  Whether a cell is still
+missing is asked again when its turn comes.
 
-`Prefetcher` asks for a wish when no demand waits for a loader (`Prefetch.next`), and reports how loads ended.
-The look-ahead, in seconds of travel, is the longest outage of the origin to be bridged plus the time of a
-load, slow loads included.  Where the path is unknown, the daemon prepares for an outage only after one has
-occurred, or on a long straight: most of those cells would be fetched in vain.
+The list has two readers: `shmmap.daemon.loading.prefetcher`, into memory, when no demand waits for a loader,
+and `shmmap.daemon.loading.outages`, onto the disk.  The look-ahead, in seconds of travel, is the longest
+outage of the origin to be bridged plus the time of a load, slow loads included.  Where the path is unknown,
+the daemon prepares for an outage only after one has occurred, or on a long straight: most of those cells
+would be fetched in vain.
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import islice, product
+from operator import attrgetter
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -95,8 +98,14 @@ class OriginHealth:
         return again
 
 
-PASS_S: Final = 2.0
-"""Interval at which a path is examined from its beginning."""
+PASS_S: Final = 1.0
+"""Shortest interval at which all paths are looked along."""
+STEP_S: Final = 0.002
+"""... for each step: it takes a twentieth of that."""
+LONGEST_PASS_S: Final = 2.0
+"""... and longest: what moves too fast for that is fetched late."""
+MAX_LISTED: Final = 4096
+"""Cells listed if there are more than twice as many: those needed first."""
 SLOWEST_MPS: Final = 0.5
 """A slower client counts as standing; without a route its path is unknown."""
 MAX_AHEAD_M: Final = 5000.0
@@ -123,7 +132,7 @@ class LookAhead(NamedTuple):
 
 @dataclass(eq=False, slots=True)
 class ClientPath:
-    """One client's path, and the current pass over it.
+    """One client's path.
 
     Attributes
     ----------
@@ -131,22 +140,14 @@ class ClientPath:
         How the client moves, kept up to date by its session.
     area, layers
         Last requested area and layers.
-    ahead_m
-        Distance that the pass has examined so far, metres.
-    is_done
-        Whether the pass has reached the end of the look-ahead.
+    jumps
+        Number of jumps of its position, as of the last `Prefetch.follow`.
     """
 
     motion: Motion
     area: Area
     layers: tuple[str, ...]
-    ahead_m: float = 0.0
-    is_done: bool = True
-    began_s: float = -math.inf
-    _inside: NDArray[np.intp] | None = None
-    _travelled_m: float = 0.0
-    _jumps: int = -1
-    _found: deque[tuple[float, int]] = field(default_factory=deque)
+    jumps: int = -1
 
     @property
     def pace_s(self) -> float:
@@ -159,51 +160,16 @@ class ClientPath:
         motion = self.motion
         return (motion.fastest_mps if motion.route is not None else motion.speed_mps) >= SLOWEST_MPS
 
-    def begin(self, now_s: float) -> None:
-        """Begin another pass."""
-        self.began_s, self.ahead_m, self.is_done = now_s, 0.0, False
-        self._inside = None
-        self._found.clear()
-        self._travelled_m, self._jumps = self.motion.travelled_m, self.motion.jumps
-
-    def first(self) -> tuple[float, int] | None:
-        """Return the cell found in this pass that is needed next: seconds until then, and its index."""
-        if not self._found or self.has_jumped:
-            return None
-        ahead_m, index = self._found[0]
-        return max(ahead_m - self.motion.travelled_m, 0.0) * self.pace_s, index
-
-    @property
-    def has_jumped(self) -> bool:
-        """Whether the client's position has jumped since the pass began."""
-        return self._jumps != self.motion.jumps
-
-    def take(self) -> None:
-        """Drop the cell that `first` returns."""
-        self._found.popleft()
-
-    def look(self, catalogue: CatalogueView, ahead: LookAhead, step_m: float) -> None:
-        """Examine the next step along the path."""
-        motion = self.motion
-        if self.has_jumped:
-            self.begin(self.began_s)
-        moved_m, self._travelled_m = motion.travelled_m - self._travelled_m, motion.travelled_m
-        self.ahead_m = max(0.0, self.ahead_m - moved_m)
-        end_m = self._end_m(ahead)
-        if self.ahead_m >= end_m or not self.moves:
-            self.is_done = True
-            return
-        if self._inside is None:
-            self._inside = self._known(catalogue, self.area, 0.0)
-        if len(self._inside) > MAX_CELLS:
-            self.is_done = True
-            return
-        here_m, self.ahead_m = self.ahead_m, min(self.ahead_m + step_m, end_m)
-        inside = self._around(catalogue, self.ahead_m, self.ahead_m * self.pace_s <= ahead.sides_s)
-        new = np.setdiff1d(inside, self._inside, assume_unique=True)
-        needed_m = motion.travelled_m + here_m
-        self._found.extend((needed_m, index) for index in new.tolist())
-        self._inside = inside
+    def look(
+        self, catalogue: CatalogueView, ahead: LookAhead, step_m: float
+    ) -> Iterator[tuple[float, list[int]]]:
+        """Look along the path: yield for each step in how many seconds which cells come into the area."""
+        ahead_m, end_m = 0.0, self._end_m(ahead) if self.moves else 0.0
+        inside = self._known(catalogue, self.area, 0.0) if end_m else np.empty(0, np.intp)
+        while ahead_m < end_m and len(inside) <= MAX_CELLS:
+            here_m, ahead_m, before = ahead_m, min(ahead_m + step_m, end_m), inside
+            inside = self._around(catalogue, ahead_m, ahead_m * self.pace_s <= ahead.sides_s)
+            yield here_m * self.pace_s, np.setdiff1d(inside, before, assume_unique=True).tolist()
 
     def _known(self, catalogue: CatalogueView, area: Area, needed_in_s: float) -> NDArray[np.intp]:
         """Return the known cells of an area; request missing pages of it, and keep its loaded ones."""
@@ -255,10 +221,10 @@ class ClientPath:
         return found[0] if len(found) == 1 else np.unique(np.concatenate(found))
 
 
-COMPARED_PER_TURN: Final = 64
-"""Paths, and cells on them, compared in one call; with more clients, choosing a wish takes several turns."""
-LOOKS_PER_WISH: Final = 2
-"""Steps along paths examined for one wish: a fifth of a millisecond."""
+READ_PER_CALL: Final = 64
+"""Cells of the list that one call passes over because they are not missing any more."""
+LOOKS_PER_CALL: Final = 2
+"""Steps along paths that one call looks: a fifth of a millisecond."""
 SLOW_LOADS: Final = 1.6
 """Consecutive loads that a cell may have to wait for."""
 SLACK_S: Final = 3.0
@@ -282,13 +248,38 @@ class Wish(NamedTuple):
     needed_in_s: float
 
 
+class _Listed(NamedTuple):
+    """A layer of a cell that a client will ask for at a time, unless its position jumps."""
+
+    needed_s: float
+    cell: int
+    layer: str
+    client: Hashable
+    jumps: int
+
+
+@dataclass(eq=False, slots=True)
+class Reader:
+    """A reader of the list.
+
+    Attributes
+    ----------
+    lacks
+        Whether it lacks a layer of a cell, by index, and may fetch it.
+    """
+
+    lacks: Callable[[int, str], bool]
+    listed: Sequence[_Listed] = ()
+    read: int = 0
+
+
 class Prefetch:
     """Chooses the cells to prefetch.
 
     Parameters
     ----------
-    is_absent
-        Whether a layer of a cell, by index, is neither in memory nor being loaded, and may be loaded.
+    is_missing
+        Whether a layer of a cell, by index, is to be listed: it is not in memory.
     outage_tolerance_s
         Duration of an outage of the origin that clients must not notice, seconds.
 
@@ -298,112 +289,95 @@ class Prefetch:
         Paths by client.
     health
         State of the origin.
-    more : bool
-        Whether asking again at once may return a wish although the last call returned none.
     """
 
-    def __init__(
-        self,
-        is_absent: Callable[[int, str], bool],
-        outage_tolerance_s: float,
-        health: OriginHealth | None = None,
-    ) -> None:
-        self._is_absent = is_absent
+    def __init__(self, is_missing: Callable[[int, str], bool], outage_tolerance_s: float) -> None:
+        self._is_missing = is_missing
         self._outage_tolerance_s = outage_tolerance_s
         self._catalogue: CatalogueView | None = None
         self.paths: dict[Hashable, ClientPath] = {}
-        self.health = health or OriginHealth()
-        self.more = False
+        self.health = OriginHealth()
         self._out_since_s = math.inf
         self._away_s = 0.0
-        self._uncompared: list[ClientPath] = []  # paths not compared yet for the next wish
-        self._behind: ClientPath | None = None  # among the compared paths: the one examined least far
-        self._chosen: ClientPath | None = None  # ... and the one with the earliest wish
-        self._best: Wish | None = None
+        self._listed: list[_Listed] = []
+        self._making: Iterator[None] | None = None  # of the next list
+        self._made_s = -math.inf
+        self._steps = 0
+        self._is_due = False  # sooner than that
 
     def follow(self, client: Hashable, motion: Motion, area: Area, layers: tuple[str, ...]) -> None:
         """Prefetch for a client, given its motion and its last requested area and layers."""
         path = self.paths.get(client)
         if path is None or path.motion is not motion:
-            self.paths[client] = ClientPath(motion, area, layers)
-        else:
-            path.area, path.layers = area, layers
-
-    def follow_like(self, other: Prefetch) -> None:
-        """Prefetch for the same clients as ``other``."""
-        for client in self.paths.keys() - other.paths.keys():
-            del self.paths[client]
-        for client, path in other.paths.items():
-            self.follow(client, path.motion, path.area, path.layers)
+            path = self.paths[client] = ClientPath(motion, area, layers)
+        path.area, path.layers = area, layers
+        if path.jumps != motion.jumps:
+            path.jumps, self._is_due = motion.jumps, True
 
     @property
     def look_ahead(self) -> LookAhead:
         """Current look-ahead; cells beyond it are not wished for yet."""
         load_s = SLOW_LOADS * self.health.slow_s + SLACK_S
-        route_s = load_s + SPARE * self._outage_tolerance_s + PASS_S + AFTER_S
+        route_s = load_s + SPARE * self._outage_tolerance_s + LONGEST_PASS_S + AFTER_S
         straight_s = load_s + min(self._outage_tolerance_s, self._away_s, GUESSED_S)
         return LookAhead(route_s, straight_s, load_s)
 
-    def next(self, catalogue: CatalogueView, now_s: float) -> Wish | None:
-        """Return the absent cell that is needed first; None if there is none, or none known yet (`more`)."""
-        self.more = False
-        is_back = self._is_back(now_s)
-        if is_back or catalogue is not self._catalogue:
-            self._uncompared = []
+    def next(self, catalogue: CatalogueView, now_s: float, reader: Reader) -> Wish | None:
+        """Return what a reader lacks and is needed first; if None, it asks again at `next_s`."""
+        if self._is_back(now_s) or catalogue is not self._catalogue:
             # indices mean other cells now, or cells skipped for a failure may be tried
+            self.restart()
             self._catalogue = catalogue
-            for path in self.paths.values():
-                path.begin(now_s)
         if now_s < self.health.next_try_s():
             return None
-        step_m = max(SHORTEST_STEP_M, 0.5 * min(catalogue.mean_size))
-        for _ in range(LOOKS_PER_WISH):
-            if not self._compare_some(now_s):
-                self.more = True
+        if self._making is None and now_s >= self._next_pass_s:
+            self._steps, self._is_due, self._making = 0, False, self._make(catalogue, now_s)
+        if self._making is not None:
+            if len(list(islice(self._making, LOOKS_PER_CALL))) == LOOKS_PER_CALL:
                 return None
-            behind, chosen, wish = self._behind, self._chosen, self._best
-            if wish is not None and (behind is None or behind is chosen or not _is_before(behind, wish)):
-                if self._is_absent(wish.cell, wish.layer):
-                    self.health.tried(now_s)
-                    return wish
-            elif behind is None:
-                return None
-            else:
-                behind.look(catalogue, self.look_ahead, step_m)
-        self.more = True
-        return None
+            self._making, self._made_s = None, now_s
+        wish = self._read(reader, now_s)
+        if wish is not None:
+            self.health.tried(now_s)
+        return wish
 
     def restart(self) -> None:
-        """Begin all paths from the start: more of the map along them is known now."""
-        self._catalogue = None
+        """Look along all paths again: more of the map along them is known now."""
+        self._catalogue, self._listed, self._making, self._made_s = None, [], None, -math.inf
 
-    def _compare_some(self, now_s: float) -> bool:
-        """Compare some paths for the least examined one and the earliest wish; return True after the last."""
-        if not self._uncompared:
-            self._uncompared = list(self.paths.values())
-            self._behind = self._chosen = self._best = None
-        for _ in range(COMPARED_PER_TURN):
-            if not self._uncompared:
-                return True
-            path = self._uncompared[-1]
-            due = now_s - path.began_s >= PASS_S and (path.is_done or path.first() is not None)
-            if path.moves and (due or path.has_jumped):
-                path.begin(now_s)
-            if (first := path.first()) is not None:
-                needed_in_s, index = first
-                absent = [layer for layer in path.layers if self._is_absent(index, layer)]
-                if not absent:
-                    path.take()
-                    continue
-                if self._best is None or needed_in_s < self._best.needed_in_s:
-                    self._chosen, self._best = path, Wish(index, absent[0], needed_in_s)
-            least = self._behind
-            if not path.is_done and (
-                least is None or path.ahead_m * path.pace_s < least.ahead_m * least.pace_s
-            ):
-                self._behind = path
-            self._uncompared.pop()
-        return not self._uncompared
+    def _read(self, reader: Reader, now_s: float) -> Wish | None:
+        """Return the first cell of the list that a reader lacks; it passes over a bounded number."""
+        if reader.listed is not self._listed:
+            reader.listed, reader.read = self._listed, 0
+        for one in reader.listed[reader.read : reader.read + READ_PER_CALL]:
+            path = self.paths.get(one.client)
+            if path is not None and path.jumps == one.jumps and reader.lacks(one.cell, one.layer):
+                return Wish(one.cell, one.layer, max(one.needed_s - now_s, 0.0))
+            reader.read += 1
+        return None
+
+    def _make(self, catalogue: CatalogueView, now_s: float) -> Iterator[None]:
+        """Look along all paths, a step at a time, and list what is missing on them."""
+        ahead, step_m = self.look_ahead, max(SHORTEST_STEP_M, 0.5 * min(catalogue.mean_size))
+        found: dict[tuple[int, str], _Listed] = {}
+        until_s = math.inf
+        for client, path in list(self.paths.items()):
+            jumps = path.jumps
+            for needed_in_s, cells in path.look(catalogue, ahead, step_m):
+                needed_s = now_s + needed_in_s
+                if needed_s >= until_s:
+                    break
+                for key in product(cells, path.layers):
+                    known = found.get(key)
+                    if (known is None or needed_s < known.needed_s) and self._is_missing(*key):
+                        found[key] = _Listed(needed_s, *key, client, jumps)
+                if len(found) > 2 * MAX_LISTED:
+                    first = sorted(found.values(), key=_needed_s)[:MAX_LISTED]
+                    found, until_s = {one[1:3]: one for one in first}, first[-1].needed_s
+                    self._is_due = True  # the others are listed next time
+                self._steps += 1
+                yield
+        self._listed = sorted(found.values(), key=_needed_s)
 
     def note_origin(self, now_s: float) -> None:
         """Note whether the origin is out, also while no wish may begin."""
@@ -421,17 +395,18 @@ class Prefetch:
             self._away_s = max(away_s, 0.5 * self._away_s)
         return True
 
-    def next_s(self, now_s: float) -> float:
-        """Return when to ask again if nothing happens until then."""
+    def next_s(self, now_s: float, reader: Reader) -> float:
+        """Return when a reader is to ask again if nothing happens until then."""
         if not any(path.moves for path in self.paths.values()):
             return math.inf
-        if self.health.is_out:
-            return self.health.next_try_s()
-        return min(
-            path.began_s + PASS_S if path.is_done else now_s for path in self.paths.values() if path.moves
-        )
+        is_read = reader.listed is self._listed and reader.read == len(self._listed)
+        next_s = self._next_pass_s if is_read and self._making is None else now_s
+        return max(next_s, self.health.next_try_s())
+
+    @property
+    def _next_pass_s(self) -> float:
+        interval_s = min(STEP_S * self._steps, LONGEST_PASS_S)
+        return self._made_s + (PASS_S if self._is_due else max(PASS_S, interval_s))
 
 
-def _is_before(path: ClientPath, wish: Wish) -> bool:
-    """Whether an unfinished pass over a path may still find an earlier wish than the given one."""
-    return path.ahead_m * path.pace_s < wish.needed_in_s
+_needed_s = attrgetter("needed_s")

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Outages of a published map's store: detected, bridged from the disk, and followed by retries.
 
-`DiskAhead` fetches onto the disk cells that do not fit in memory.  It follows the same paths as `Prefetcher`,
-as far ahead, and begins where `Prefetcher` has no memory left.  It fetches the objects of cells that are
+`DiskAhead` fetches onto the disk cells that do not fit in memory.  It reads the same list as `Prefetcher`
+(`shmmap.daemon.loading.look_ahead`) when that has no memory left.  It fetches the objects of cells that are
 neither in memory nor on the disk, in the order in which they will be needed, and only while no load waits for
 a loader and the link has room (`shmmap.daemon.loading.link`).
 """
@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
-from shmmap.daemon.loading.look_ahead import Prefetch
+from shmmap.daemon.loading.look_ahead import Reader
 from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.map.object_keeper import KeptCell, ObjectKeeper
 from shmmap.daemon.map.origin_link import OriginLink
@@ -83,8 +83,7 @@ class DiskAhead:
 
     def __init__(self, cache: CellCache, scheduler: Scheduler, keeper: ObjectKeeper) -> None:
         self._cache, self._scheduler, self._keeper = cache, scheduler, keeper
-        prefetcher = scheduler.prefetcher
-        self._prefetch = Prefetch(self._is_lacking, prefetcher.outage_tolerance_s, prefetcher.health)
+        self._prefetch, self._reader = scheduler.prefetcher.prefetch, Reader(self._is_lacking)
         self._map_version = 0
         self._rest: dict[tuple[int, str], float] = {}  # until when a layer of a cell is not checked again
         self._lacking: set[tuple[int, str]] = set()  # not on the disk when last checked
@@ -94,7 +93,7 @@ class DiskAhead:
     @property
     def next_s(self) -> float:
         """When there is something to do; never while no client moves."""
-        if not self._scheduler.prefetcher.prefetch.paths or self._keeper.free_places <= 0:
+        if not self._prefetch.paths or self._keeper.free_places <= 0:
             return math.inf
         return self._next_s
 
@@ -105,7 +104,6 @@ class DiskAhead:
         is_asked = now_s >= self._resume_s and self._scheduler.prefetcher.lacks_room(now_s)
         may_begin = link is None or link.may_begin(now_s, ahead=True)
         if not is_asked or len(self._scheduler.loads) or not may_begin:
-            self._prefetch.restart()  # so that its catalogue can be freed
             if not is_asked:
                 self._forget()
             self._next_s = now_s + LOOK_S
@@ -115,11 +113,10 @@ class DiskAhead:
             self._map_version = catalogue.map_version
             self._rest.clear()  # indices mean other cells
             self._forget()
-        self._prefetch.follow_like(self._scheduler.prefetcher.prefetch)
-        wish = self._prefetch.next(catalogue, now_s)
+        wish = self._prefetch.next(catalogue, now_s, self._reader)
         if wish is None:
-            self._next_s = now_s if self._prefetch.more else self._prefetch.next_s(now_s)
-            if not self._prefetch.more and not self._prefetch.health.is_out:
+            self._next_s = self._prefetch.next_s(now_s, self._reader)
+            if self._next_s > now_s and not self._prefetch.health.is_out:
                 self._cache.statistics.set("disk_ahead", int(not self._lacking))
             return
         self._lacking.add((wish.cell, wish.layer))

@@ -15,9 +15,10 @@ from collections import deque
 from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
+from shmmap.daemon.cache.evictor import Freeing
 from shmmap.daemon.loading.link import Link
 from shmmap.daemon.loading.loads import Attempt, Load, Loads, Purpose
-from shmmap.daemon.loading.look_ahead import URGENT_S, Prefetch
+from shmmap.daemon.loading.look_ahead import URGENT_S, Prefetch, Reader
 from shmmap.daemon.loading.worker_pool import WorkerPool
 from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.transport.sessions import MOVES_PER_STEP, Session
@@ -66,7 +67,8 @@ class Prefetcher:
         self.cold: deque[tuple[Session, Key]] = deque(maxlen=MAX_COLD)
         self.ended: deque[tuple[Load, Attempt | None, bool]] = deque(maxlen=MAX_ENDED)
         self.share, self.outage_tolerance_s = share, outage_tolerance_s
-        self.prefetch = Prefetch(self._is_absent, outage_tolerance_s)
+        self.prefetch = Prefetch(self._is_missing, outage_tolerance_s)
+        self._reader = Reader(self._is_absent)
         self.health = self.prefetch.health
         self._now_s = 0.0
         self._next_s = -math.inf
@@ -153,9 +155,9 @@ class Prefetcher:
 
     def _wish(self, now_s: float) -> None:
         cache, prefetch = self._cache, self.prefetch
-        wish = prefetch.next(cache.catalogue, now_s)
+        wish = prefetch.next(cache.catalogue, now_s, self._reader)
         if wish is None:
-            self._next_s = now_s if prefetch.more else prefetch.next_s(now_s)
+            self._next_s = prefetch.next_s(now_s, self._reader)
             return
         if wish.needed_in_s > URGENT_S and self._pool.free_places <= self.kept_places:
             # the last places are kept for demands, until a load ends or a client comes nearer
@@ -186,10 +188,14 @@ class Prefetcher:
         box = self._cache.catalogue.box(index)
         return Resident("", key, 0, nbytes, 0, box, 0.0, 0.0, last_use_s=self._now_s)
 
+    def _is_missing(self, index: int, layer: str) -> bool:
+        """Whether a layer of a cell is not in memory."""
+        return self._cache.find_warm(index, layer, self._now_s) is None
+
     def _is_absent(self, index: int, layer: str) -> bool:
         """Whether a cell could be prefetched; a cell larger than the share never can."""
         key = self._cache.key(index, layer)
-        if self._cache.find_warm(index, layer, self._now_s) is not None or key in self._loads.by_key:
+        if key in self._loads.by_key or not self._is_missing(index, layer):
             return False
         failure = self._loads.failures.get(key)
         may_fit = self._cache.estimate(index, layer) <= self.budget_bytes
@@ -202,7 +208,7 @@ class Prefetcher:
         index = self._cache.index_of(load.key.cell_id)
         if index is not None:
             wished = self._wished(load.key, index, load.estimate)
-            if self._evictor.free(shortage, now_s, rather_than=wished):
+            if self._evictor.free(shortage, now_s, rather_than=wished) is not Freeing.NO_MORE:
                 return True
         self.full(now_s)
         return False

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
-from shmmap.daemon.cache.evictor import Evictor
+from shmmap.daemon.cache.evictor import Evictor, Freeing
 from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.cache.lost_segments import LostSegments
 from shmmap.daemon.cache.reclaimer import Reclaimer
@@ -93,8 +93,7 @@ class Room:
             needed, budget = format_bytes(load.estimate), format_bytes(ledger.budget_bytes)
             return Refused(f"the cell needs {needed}, the whole budget is {budget}")
         more = min(behind, ledger.budget_bytes // AHEAD_SHARE)
-        free = self.evictor.free
-        if free(shortage + more, now_s) or free(shortage, now_s) or self._may_be_given_back():
+        if any(self._may_come(nbytes, now_s) for nbytes in (shortage + more, shortage)):
             return None
         return Refused(f"the budget of {format_bytes(ledger.budget_bytes)} is in use")
 
@@ -112,7 +111,7 @@ class Room:
     def _state(self, running: int) -> tuple[int, ...]:
         """Return a value that differs whenever memory may be free, or another load is next."""
         ledger = self.ledger
-        return ledger.shortage(0), ledger.coming_bytes, ledger.order.changes, self.loads.changes, running
+        return ledger.shortage(0), ledger.coming_bytes, ledger.evictable.changes, self.loads.changes, running
 
     def ask(self, worker: Worker, message: Need) -> None:
         """Note that a worker needs more than was reserved for it; it waits for `grant`."""
@@ -136,18 +135,18 @@ class Room:
                     elif load.work is Purpose.SPARE:
                         freed = False
                     else:
-                        freed = self.evictor.free(shortage, now_s) or self._may_be_given_back()
+                        freed = self._may_come(shortage, now_s)
                     if freed:
                         continue
                 self.pool.answer(worker, Decision(granted))
             del self.awaiting_grant[number]
 
-    def _may_be_given_back(self) -> bool:
-        """Whether a running load will end without more memory: it may use less than is reserved for it.
+    def _may_come(self, shortage: int, now_s: float) -> bool:
+        """Free memory; return whether ``shortage`` bytes are, or may become, free.
 
-        Loads that wait for memory do not end by themselves, nor do the loads queued after them in the same
-        loader.
+        A running load may use less than is reserved for it.  Loads that wait for memory do not end by
+        themselves, nor do the loads queued after them in the same loader.
         """
-        return any(
+        return self.evictor.free(shortage, now_s) is not Freeing.NO_MORE or any(
             worker.queue and self.awaiting_grant.keys().isdisjoint(worker.queue) for worker in self.pool
         )

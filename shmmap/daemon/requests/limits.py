@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from shmmap.daemon.cache.cell_cache import CellCache
-from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S
+from shmmap.daemon.cache.eviction_plan import HAND_OUT_GRACE_S
 from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.requests.pending_request import PendingRequest

@@ -1,23 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The order in which segments are evicted: by scores, as a plain sort says, and how little work it takes."""
+"""Which segments are evicted next: by scores, as a plain sort says, in bounded steps."""
 
 from __future__ import annotations
 
 import math
 import random
-from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from shmmap.daemon.cache.eviction_order import BATCH, FRONT, TRIES, Deferred, EvictionOrder, Score
-from shmmap.daemon.cache.evictor import SOON_S, eviction_scores
+from shmmap.daemon.cache.eviction_plan import (
+    BLOCK,
+    HAND_OUT_GRACE_S,
+    MAX_LISTED,
+    SOON_S,
+    EvictionPlan,
+    eviction_scores,
+)
+from shmmap.daemon.cache.ledger import DUE_PER_CALL, IN_USE_S, MAX_IN_USE_S, SHARE_S, Evictable
 from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.travel.motion import Motion
-from shmmap.daemon.travel.places import Places, merged_places, places_of, until_needed
+from shmmap.daemon.travel.places import PAIRS_PER_BLOCK, Places, merged_places, places_of, until_needed
 from shmmap.protocol.messages import Intent
 
 coordinates = st.floats(-1e5, 1e5)
@@ -92,6 +97,32 @@ def test_examples() -> None:
     assert ordered([far_used, near_unused]) == [near_unused, far_used]
 
 
+def made_plan(some: list[Resident], places: Places, now_s: float) -> EvictionPlan:
+    plan = EvictionPlan(places, 1, now_s)
+    for _ in plan.make(iter(some), lambda _one: True):
+        pass
+    return plan
+
+
+def in_turn(plan: EvictionPlan) -> list[Resident]:
+    """Those that go, in order."""
+    found = []
+    while (one := plan.first()) is not None:
+        found.append(one.resident)
+        plan.listed.pop()
+    return found
+
+
+Rank = tuple[bool, bool, float, float]
+
+
+def rank(one: Resident, places: Places, now_s: float) -> Rank:
+    """The least goes first: not just handed out, held by no session, needed last, unused for longest."""
+    in_grace = one.last_use_s + HAND_OUT_GRACE_S > now_s
+    score = 0.0 if in_grace else -float(eviction_scores([one], places, now_s)[0])
+    return in_grace, bool(one.sessions), score, one.last_use_s
+
+
 def numbered(number: int, last_use_s: float = 0.0) -> Resident:
     return Resident(
         f"/{number}", Key(f"/{number}.pcd", "points"), number, 100, 0, (0.0,) * 4, 0.0, 0.0,
@@ -99,206 +130,132 @@ def numbered(number: int, last_use_s: float = 0.0) -> Resident:
     )  # fmt: skip
 
 
-class Worth:
-    """Scores as a test says."""
-
-    def __init__(self) -> None:
-        self.of_number: dict[int, float] = {}
-        self.version = 0
-        self.calls = 0
-
-    def __call__(self, some: Sequence[Resident]) -> list[float]:
-        self.calls += 1
-        return [self.of_number[one.version] for one in some]
-
-    @property
-    def score(self) -> Score:
-        return Score(self, self.version)
-
-    def rank(self, one: Resident) -> tuple[bool, float, float]:
-        """The least goes first."""
-        return bool(one.sessions), -self.of_number[one.version], one.last_use_s
-
-
-def offered(order: EvictionOrder, worth: Worth, now_s: float) -> list[Resident]:
-    """What should go first, once there are enough in order."""
-    while order.fill(worth.score, now_s):
-        pass
-    while (front := order.front(worth.score)) is None:
-        pass
-    return front
-
-
-class Machine(RuleBasedStateMachine):
-    """As few segments as are offered at once: always exactly as a sort says, whatever moves or is used."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.order, self.worth = EvictionOrder(), Worth()
-        self.known: dict[Resident, float] = {}  # since when they may go
-        self.now_s = 10.0
-        self.number = 0
-
-    def any(self, draw: int) -> Resident:
-        return list(self.known)[draw % len(self.known)]
-
-    @precondition(lambda self: len(self.known) < FRONT)
-    @rule(score=st.integers(0, 5), last_use_s=st.integers(0, 5))
-    def enter(self, score: int, last_use_s: int) -> None:
-        self.number += 1
-        one = numbered(self.number, last_use_s)
-        self.worth.of_number[self.number] = score
-        self.known[one] = -math.inf
-        self.order.new[one] = None
-
-    @precondition(lambda self: self.known)
-    @rule(draw=st.integers(0, 100))
-    def leave(self, draw: int) -> None:
-        one = self.any(draw)
-        del self.known[one]
-        self.order.leave(one)
-
-    @precondition(lambda self: self.known)
-    @rule(draw=st.integers(0, 100), delay_s=st.sampled_from([0.5, 2.0, math.inf]), in_grace=st.booleans())
-    def defer(self, draw: int, delay_s: float, in_grace: bool) -> None:
-        one = self.any(draw)
-        self.order.defer(one, self.order.in_grace if in_grace else self.order.deferred, self.now_s + delay_s)
-        self.known[one] = self.now_s + delay_s
-
-    @precondition(lambda self: self.known)
-    @rule(draw=st.integers(0, 100))
-    def reconsider(self, draw: int) -> None:
-        one = self.any(draw)
-        if one not in self.order.in_grace:
-            self.known[one] = -math.inf
-        self.order.reconsider(one)
-
-    @rule()
-    def reconsider_all(self) -> None:
-        self.order.reconsider_all()
-        for one in self.known:
-            if one not in self.order.in_grace:
-                self.known[one] = -math.inf
-
-    @precondition(lambda self: self.known)
-    @rule(draw=st.integers(0, 100), held=st.booleans())
-    def use(self, draw: int, held: bool) -> None:
-        one = self.any(draw)
-        one.last_use_s = self.now_s
-        (one.sessions.add if held else one.sessions.discard)(7)
-
-    @precondition(lambda self: self.known)
-    @rule(draw=st.integers(0, 100), score=st.integers(0, 5))
-    def move(self, draw: int, score: int) -> None:
-        self.worth.of_number[self.any(draw).version] = score
-        self.worth.version += 1
-
-    @rule(seconds=st.sampled_from([0.0, 0.4, 3.0]))
-    def tick(self, seconds: float) -> None:
-        self.now_s += seconds
-
-    @invariant()
-    def offered_as_sorted(self) -> None:
-        front = offered(self.order, self.worth, self.now_s)
-        free = sorted((one for one, since in self.known.items() if since <= self.now_s), key=self.worth.rank)
-        assert set(front) == set(free)
-        assert [self.worth.rank(one) for one in front] == [self.worth.rank(one) for one in free]
-        assert len(self.order) == len(self.known)
-
-
-TestOrder = Machine.TestCase
-TestOrder.settings = settings(max_examples=100, stateful_step_count=60, deadline=None)
-
-
-@pytest.mark.parametrize("count", [100, 5000])
-def test_all_of_many_in_order(count: int) -> None:
-    """While nothing moves, exactly as a sort says, also what came in between and was used since."""
-    random.seed(count)
-    order, worth = EvictionOrder(), Worth()
-    some = [numbered(number, random.random()) for number in range(count)]
+@given(
+    residents(), st.lists(points, max_size=3), st.lists(st.booleans(), min_size=12, max_size=12), st.data()
+)
+def test_a_plan_is_as_a_sort_says(
+    some: list[Resident], where: list[tuple[float, float]], held: list[bool], data: st.DataObject
+) -> None:
+    """Also when segments are used after it was made: these go last, the first used first."""
+    now_s = 100.0
+    places = merged_places(client(*place, 10.0, 5.0) for place in where)
     for one in some:
-        worth.of_number[one.version] = random.random() * 100
-        order.new[one] = None
-    while order.new:
-        order.score_new(worth.score)
-    for one in random.sample(some, count // 3):
-        one.last_use_s += 1.0
-    gone: list[Resident] = []
-    while front := offered(order, worth, 0.0):
-        for one in front[:7]:
-            order.leave(one)
-            gone.append(one)
-    assert gone == sorted(some, key=worth.rank)
+        one.last_use_s = data.draw(st.sampled_from([1.0, 2.0, 99.5, 99.8]))
+        one.spare = data.draw(st.booleans())
+        one.sessions = data.draw(st.sampled_from([set(), {7}]))
+    expected = sorted(some, key=lambda one: rank(one, places, now_s))
+    plan = made_plan(some, places, now_s)
+    assert plan.is_whole
+    found = [candidate.resident for candidate in reversed(plan.listed)]
+    assert [rank(one, places, now_s) for one in found] == [rank(one, places, now_s) for one in expected]
+    used = [one for one in found if data.draw(st.booleans())]
+    for number, one in enumerate(used):
+        one.last_use_s = now_s + number / 8.0
+    rest = [one for one in found if one not in used]
+    past = [one for one in rest if one.last_use_s + HAND_OUT_GRACE_S <= now_s]
+    in_turn_now = in_turn(plan)
+    assert in_turn_now[: len(past)] == past
+    assert set(in_turn_now) == set(some)
+    assert [one for one in in_turn_now if one in used] == sorted(
+        used, key=lambda one: (bool(one.sessions), one.last_use_s)
+    )
 
 
-def settled(count: int, worth: Worth) -> tuple[EvictionOrder, list[Resident]]:
-    order, some = EvictionOrder(), [numbered(number) for number in range(count)]
+@pytest.mark.parametrize("clients", [0, 1, 200])
+def test_of_very_many_the_first_are_listed_in_bounded_steps(clients: int) -> None:
+    random.seed(clients)
+    some = [made(str(n), random.uniform(0, 1e4), last_use_s=random.random()) for n in range(MAX_LISTED + 500)]
+    places = merged_places(client(50.0 * n, 100.0) for n in range(clients))
+    expected = sorted(some, key=lambda one: rank(one, places, 100.0))[:MAX_LISTED]
+    plan, looked = EvictionPlan(places, 1, 100.0), list[int]()
+
+    def counted(_one: Resident) -> bool:
+        looked[-1] += 1
+        return True
+
+    steps = plan.make(iter(some), counted)
+    looked.append(0)
+    for _ in steps:
+        assert not plan.listed
+        looked.append(0)
+    assert MAX_LISTED < sum(looked) <= len(some)
+    assert max(looked) <= BLOCK
+    assert max(looked) * len(places) <= 2 * PAIRS_PER_BLOCK
+    assert len(looked) >= len(some) / max(looked)
+    assert not plan.is_whole
+    found = in_turn(plan)
+    assert [rank(one, places, 100.0) for one in found] == [rank(one, places, 100.0) for one in expected]
+
+
+def test_more_is_listed_where_it_belongs() -> None:
+    here = client(5.0, 5.0)
+    near, middle, far = made("near", 60), made("middle", 150), made("far", 500)
+    plan = made_plan([near, far], here, 10.0)
+    plan.add([middle])
+    assert in_turn(plan) == [far, middle, near]
+    assert plan.score(far) > plan.score(middle) > plan.score(near)
+
+
+# --- what was found in use ------------------------------------------------------------------------
+
+
+def test_a_segment_in_use_is_left_alone_for_longer_and_longer() -> None:
+    """Where its next close is not reported, always for the same time."""
+    evictable, one, now_s = Evictable(), numbered(1), 50.0
+    waits = []
+    for _ in range(7):
+        evictable.found_in_use(one, now_s, is_watched=True)
+        waits.append(evictable.next_look_s() - now_s)
+        now_s = evictable.next_look_s()
+        assert evictable.is_left_alone(one, math.nextafter(now_s, 0.0))
+        evictable.look_again(math.nextafter(now_s, 0.0))
+        assert not evictable.new
+        assert not evictable.is_left_alone(one, now_s)
+        evictable.look_again(now_s)
+        assert list(evictable.new) == [one]
+        del evictable.new[one]
+    assert waits == pytest.approx([0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 5.0])
+    assert (IN_USE_S, MAX_IN_USE_S) == (0.2, 5.0)
+    for _ in range(3):
+        evictable.found_in_use(one, now_s, is_watched=False)
+        assert evictable.next_look_s() - now_s == pytest.approx(IN_USE_S)
+        now_s = evictable.next_look_s()
+        evictable.look_again(now_s)
+    assert evictable.release(one), "it is another use from now on"
+    assert not evictable.release(one)
+    evictable.found_in_use(one, now_s, is_watched=True)
+    assert evictable.next_look_s() - now_s == pytest.approx(IN_USE_S)
+
+
+def test_of_very_many_in_use_few_are_looked_at_again_at_a_time() -> None:
+    evictable, some = Evictable(), [numbered(number) for number in range(2000)]
     for one in some:
-        worth.of_number[one.version] = float(one.version)
-        order.new[one] = None
-    while order.new:
-        order.score_new(worth.score)
-    return order, some
+        evictable.found_in_use(one, 0.0, is_watched=True)
+    assert evictable.is_left_alone(some[-1], 0.9 * SHARE_S * len(some))
+    evictable.look_again(2.0)
+    assert len(evictable.new) == DUE_PER_CALL
+    for one in some[DUE_PER_CALL : 3 * DUE_PER_CALL]:
+        evictable.leave(one)  # out of service
+    evictable.look_again(2.0)
+    evictable.look_again(2.0)
+    assert len(evictable.new) == DUE_PER_CALL, "the dead are passed over, some at a time"
+    evictable.look_again(2.0)
+    assert len(evictable.new) == 2 * DUE_PER_CALL
 
 
-def test_when_clients_move_nothing_goes_by_an_old_score() -> None:
-    """What is worth keeping now stays although its score is old; what is worth less now is found later."""
-    worth = Worth()
-    order, some = settled(10_000, worth)
-    near, far = some[-FRONT:], some[:FRONT]
-    worth.version += 1
-    worth.of_number.update({one.version: 0.0 for one in near})
-    worth.of_number.update({one.version: 1e9 for one in far})
-    front = offered(order, worth, 0.0)
-    assert front == some[-FRONT - 1 : -2 * FRONT - 1 : -1]
-    order.refresh(some[:BATCH], worth.score)
-    assert set(offered(order, worth, 0.0)) == set(far)
-
-
-@pytest.mark.parametrize("count", [1000, 20_000])
-def test_the_work_for_a_victim_does_not_depend_on_how_many_there_are(count: int) -> None:
-    worth = Worth()
-    order, _ = settled(count, worth)
-    scored, calls = order.scored, worth.calls
-    for _ in range(100):
-        order.leave(offered(order, worth, 0.0)[0])
-    assert order.scored == scored, "nothing has moved"
-    worth.version += 1  # everything may be elsewhere
-    worth.of_number = dict.fromkeys(worth.of_number, 1.0)
-    for _ in range(100):
-        before = order.scored
-        order.leave(offered(order, worth, 0.0)[0])
-        assert order.scored - before <= TRIES * FRONT
-    assert worth.calls - calls <= 100 * TRIES
-    assert order.scored - scored <= 100 * TRIES * FRONT
-    assert len(order) == count - 200
-
-
-def test_few_come_back_at_a_time() -> None:
-    """Of those that are due, and of all that are reconsidered."""
-    worth = Worth()
-    order, some = settled(4 * BATCH, worth)
-    for one in some:
-        order.defer(one, order.deferred, 5.0)
-    assert offered(order, worth, 4.0) == []
-    before = order.scored
-    assert len(offered(order, worth, 5.0)) == FRONT
-    assert order.scored - before == FRONT
-    assert len(order.deferred) == 2 * BATCH
-    order.reconsider_all()
-    assert len(order.deferred) == 0
-    offered(order, worth, 5.0)
-    assert order.scored - before == FRONT, "there are enough"
-    order.score_new(worth.score)
-    assert order.scored - before == FRONT + BATCH
-
-
-def test_very_many_that_are_released_at_once_are_forgotten_a_few_at_a_time() -> None:
-    """As when a client that has mapped them leaves."""
-    deferred, some = Deferred(), [numbered(number) for number in range(4 * BATCH)]
-    for one in some:
-        deferred.put(one, float(one.version))
-    for one in some[:-1]:
-        deferred.take(one)
-    assert deferred.first() == (BATCH, some[BATCH])
-    assert [deferred.first() for _ in range(3)][-1] == (4 * BATCH - 1, some[-1])
+@pytest.mark.parametrize("mapped", [3, 30])
+def test_all_may_have_been_released(mapped: int) -> None:
+    """As when the kernel could not report all closes."""
+    evictable, some = Evictable(), [numbered(number) for number in range(40)]
+    for one in some[mapped:]:
+        evictable.add(one)
+    for one in some[:mapped]:
+        evictable.found_in_use(one, 0.0, is_watched=True)
+    before = evictable.changes
+    evictable.release_all()
+    assert evictable.changes > before
+    assert set(evictable.new) == set(some)
+    assert not any(evictable.is_left_alone(one, 0.0) for one in some)
+    assert evictable.next_look_s() == math.inf
+    evictable.leave(some[0])
+    assert some[0] not in evictable.new

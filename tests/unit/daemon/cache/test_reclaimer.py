@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import mmap
 import os
+import random
 import select
 import threading
 from collections.abc import Iterator
@@ -14,14 +15,17 @@ from typing import Any
 import pytest
 
 from shmmap.daemon.cache import reclaimer
-from shmmap.daemon.cache.evictor import WORK_PER_TURN, Evictor
+from shmmap.daemon.cache.eviction_plan import BLOCK, HAND_OUT_GRACE_S
+from shmmap.daemon.cache.evictor import LOOKS_PER_CALL, PLAN_S, PRESSURE_S, STEP_S, Evictor, Freeing
 from shmmap.daemon.cache.ledger import Ledger
-from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S, LOOKS_PER_TURN, TICK_S, Reclaimer
+from shmmap.daemon.cache.reclaimer import LOOKS_PER_TURN, TICK_S, Reclaimer
 from shmmap.daemon.pins.watch import PinWatch
 from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.transport.sessions import Sessions
+from shmmap.protocol.messages import Intent
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import prepare_process
+from tests.support import connections
 
 SMALL, LARGE = 4096, 1 << 20
 
@@ -118,7 +122,7 @@ def test_a_large_segment_s_memory_counts_until_it_is_free(
     assert os.listdir(memory.directory.path) == []
     assert (ledger.used_bytes, ledger.freeing_bytes, ledger.coming_bytes) == (LARGE, LARGE, LARGE)
     assert memory.reclaimer.collect() == 0
-    assert memory.evictor.free(LARGE, NOW_S), "it will come"
+    assert memory.evictor.free(LARGE, NOW_S) is Freeing.ENOUGH, "it will come"
     may_close.set()
     assert memory.wait_for_the_thread() == LARGE
     assert (ledger.used_bytes, ledger.freeing_bytes, ledger.retired_bytes) == (0, 0, 0)
@@ -211,7 +215,7 @@ def test_nothing_is_freed_before_its_tick_is_over(memory: Memory) -> None:
 def test_room_is_made_by_a_few_looks_a_turn(memory: Memory) -> None:
     """Past whatever is mapped, needed or was just handed out, which is not looked at each time."""
     memory.ledger.budget_bytes = 0
-    used = memory.publish(2 * WORK_PER_TURN)
+    used = memory.publish(2 * LOOKS_PER_CALL)
     mapped = [memory.map(resident) for resident in used]
     needed, free = memory.publish(3), memory.publish(3)
     for number, resident in enumerate((*used, *needed, *free)):
@@ -221,9 +225,9 @@ def test_room_is_made_by_a_few_looks_a_turn(memory: Memory) -> None:
     missing = len(free) * SMALL
     looks = memory.until_it_waits(missing)
     assert sum(looks) == len(used) + 2 * len(free)  # once more when it has another name
-    assert max(looks) == WORK_PER_TURN
+    assert max(looks) == LOOKS_PER_CALL
     assert list(memory.ledger.retired) == [one.name for one in free]
-    assert not memory.evictor.free(missing + SMALL, NOW_S)
+    assert memory.evictor.free(missing + SMALL, NOW_S) is Freeing.NO_MORE
     assert memory.looked() == 0, "nothing has changed"
     memory.ledger.need_no_more(needed[0].key)
     mapped[0].close()
@@ -236,9 +240,9 @@ def test_room_is_made_by_a_few_looks_a_turn(memory: Memory) -> None:
     assert memory.evictor.wake_s == NOW_S + HAND_OUT_GRACE_S
     assert needed[1].name not in memory.ledger.retired
     memory.looked()
-    assert memory.evictor.free(memory.ledger.coming_bytes + SMALL, NOW_S)
+    assert memory.evictor.free(memory.ledger.coming_bytes + SMALL, NOW_S) is Freeing.LATER
     assert memory.evictor.wake_s == NOW_S + HAND_OUT_GRACE_S
-    assert memory.looked() == 0, "it waits"
+    assert memory.looked() == 1, "it waits for that one"
     memory.ledger.need_no_more(needed[2].key)
     memory.until_it_waits(memory.ledger.coming_bytes + SMALL)
     assert needed[2].name in memory.ledger.retired, "something has changed"
@@ -274,11 +278,9 @@ def test_what_the_kernel_reports_is_looked_at_less_and_less(memory: Memory) -> N
         found = []
         for _ in range(8):
             assert sum(memory.until_it_waits(SMALL, now_s)) == 1
-            assert not memory.evictor.free(SMALL, now_s)
-            first = memory.ledger.order.deferred.first()
-            assert first is not None
-            found.append(round(first[0] - now_s, 3))
-            now_s = first[0]
+            assert memory.evictor.free(SMALL, now_s) is Freeing.NO_MORE
+            found.append(round(memory.ledger.evictable.next_look_s() - now_s, 3))
+            now_s = memory.ledger.evictable.next_look_s()
         return found
 
     longer = [0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 5.0, 5.0]
@@ -292,3 +294,100 @@ def test_what_the_kernel_reports_is_looked_at_less_and_less(memory: Memory) -> N
     mapped.close()
     memory.until_it_waits(SMALL, now_s)
     assert one.name in memory.ledger.retired
+
+
+# --- which go first -------------------------------------------------------------------------------
+
+
+def evicted(memory: Memory, count: int, now_s: float) -> list[Resident]:
+    """Evict this many, and return them in order."""
+    found = []
+    for _ in range(count):
+        memory.until_it_waits(memory.ledger.coming_bytes + SMALL, now_s)
+        found.append([*memory.ledger.retired.values()][-1].resident)
+    return found
+
+
+def test_clients_decide_soon_after_they_have_moved(memory: Memory) -> None:
+    """A plan is made at most each quarter of a second, and none once there was memory for long."""
+    some = memory.publish(30)
+    for number, resident in enumerate(some):
+        resident.box = (100.0 * number, 0.0, 100.0 * number + 20.0, 20.0)
+    sessions, evictor = memory.reclaimer.sessions, memory.evictor
+    session = sessions.open(connections.of(), "car", NOW_S)
+
+    def drive_to(x: float) -> None:
+        session.state_intent(Intent(x, 10.0))
+        assert sessions.follow_moves() == [session]
+
+    drive_to(0.0)
+    assert evictor.next_s == float("inf"), "memory was never short"
+    assert evicted(memory, 3, NOW_S) == some[:-4:-1]
+    assert evictor.next_s == float("inf"), "nothing has changed"
+    drive_to(2900.0)
+    assert evictor.next_s == NOW_S + PLAN_S
+    assert evicted(memory, 1, NOW_S) == [some[-4]], "so much is decided"
+    evictor.run_step(NOW_S + PLAN_S)
+    assert evictor.next_s == float("inf")
+    assert evicted(memory, 3, NOW_S + PLAN_S) == some[:3]
+    drive_to(0.0)
+    later_s = NOW_S + PLAN_S + PRESSURE_S
+    assert evictor.next_s < later_s
+    evictor.run_step(later_s)
+    drive_to(1200.0)
+    assert evictor.next_s == float("inf"), "there was enough memory for long"
+    evictor.free(memory.ledger.coming_bytes + SMALL, later_s + PRESSURE_S)
+    assert [*memory.ledger.retired.values()][-1].resident is some[-5], "an old plan is replaced before"
+
+
+def test_of_many_the_first_go_when_all_have_been_looked_at(memory: Memory) -> None:
+    """In several calls, or steps while no load waits; what comes meanwhile goes when nothing else is left."""
+    some = memory.publish(2 * BLOCK + 5)
+    random.Random(3).shuffle(some)
+    for number, resident in enumerate(some):
+        resident.last_use_s = number / 1e3
+    evictor = memory.evictor
+    for _ in range(2):
+        assert evictor.free(SMALL, NOW_S) is Freeing.LATER
+        assert evictor.wake_s == NOW_S
+        assert not memory.ledger.retired, "not all have been looked at"
+    spare = memory.publish(1)[0]
+    assert evicted(memory, 100, NOW_S) == some[:100]
+    assert evictor.next_s == NOW_S + PLAN_S, "there is another segment"
+    at_s, steps = NOW_S, 0
+    while evictor.next_s < float("inf"):
+        at_s, steps = evictor.next_s, steps + 1
+        evictor.run_step(at_s)
+    assert steps == 3
+    assert at_s == pytest.approx(NOW_S + PLAN_S + 2.0 * STEP_S)
+    assert evicted(memory, 1, at_s) == [spare]
+    last = memory.publish(1)[0]
+    rest = len(some) - 100
+    assert evicted(memory, rest, at_s) == some[100:]
+    assert evicted(memory, 1, at_s) == [last]
+    assert evictor.free(memory.ledger.coming_bytes + 1, at_s) is Freeing.NO_MORE
+
+
+def test_the_first_plan_is_made_before_memory_is_short(memory: Memory) -> None:
+    memory.publish(7)
+    ledger, evictor = memory.ledger, memory.evictor
+    ledger.budget_bytes = 8 * SMALL
+    assert evictor.next_s == float("inf")
+    memory.publish(1)
+    assert evictor.next_s <= NOW_S
+    evictor.run_step(NOW_S)
+    assert evictor.next_s == float("inf")
+
+
+def test_a_wish_takes_only_what_is_needed_later(memory: Memory) -> None:
+    some = memory.publish(3)
+    for number, resident in enumerate(some):
+        resident.last_use_s = 10.0 * number
+    wish = Resident("", Key("wish", "points"), 9, SMALL, 0, (0.0, 0.0, 1.0, 1.0), 0.0, 0.0, last_use_s=15.0)
+
+    def free() -> Freeing:
+        return memory.evictor.free(memory.ledger.coming_bytes + SMALL, NOW_S, rather_than=wish)
+
+    assert free() is Freeing.LATER, "first a plan is made"
+    assert [free(), free(), free()] == [Freeing.ENOUGH, Freeing.ENOUGH, Freeing.NO_MORE]
+    assert [one.resident for one in memory.ledger.retired.values()] == some[:2]

@@ -5,26 +5,29 @@ from __future__ import annotations
 
 import math
 from functools import cache
-from itertools import pairwise
+from itertools import islice, pairwise
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from shmmap.daemon.loading import look_ahead
 from shmmap.daemon.loading.look_ahead import (
     BESIDE_M,
-    COMPARED_PER_TURN,
     IN_A_ROW,
-    LOOKS_PER_WISH,
+    LONGEST_PASS_S,
+    LOOKS_PER_CALL,
     MAX_CELLS,
     PASS_S,
     PROBE_S,
+    READ_PER_CALL,
     SLACK_S,
     ClientPath,
     LookAhead,
     OriginHealth,
     Prefetch,
+    Reader,
     Wish,
 )
 from shmmap.daemon.travel.motion import Motion
@@ -117,26 +120,13 @@ def path_of(motion: Motion, area: Area | None = None) -> ClientPath:
     return ClientPath(motion, area or Circle(motion.x, motion.y, RADIUS_M), ("points",))
 
 
-def taken(path: ClientPath) -> list[tuple[float, int]]:
-    """What a path has found: seconds, and indices."""
-    found = []
-    while (first := path.first()) is not None:
-        found.append(first)
-        path.take()
-    return found
-
-
 def looked(
     path: ClientPath, ahead: LookAhead = AHEAD, catalogue: Catalogue | None = None
 ) -> list[tuple[float, int]]:
-    """Look along all of a path."""
-    path.begin(0.0)
-    for _ in range(2000):
-        if path.is_done:
-            break
-        path.look(catalogue or town(), ahead, STEP_M)
-    assert path.is_done
-    return taken(path)
+    """What is found along all of a path: seconds, and indices."""
+    steps = list(islice(path.look(catalogue or town(), ahead, STEP_M), 2000))
+    assert len(steps) < 2000
+    return [(needed_in_s, cell) for needed_in_s, cells in steps for cell in cells]
 
 
 def cells_at(x: float, y: float, radius: float = RADIUS_M) -> set[int]:
@@ -233,44 +223,6 @@ def test_at_a_red_light_a_client_with_a_route_will_go_on(speed: float, route: Ve
     assert bool(looked(path)) is moves
 
 
-def test_a_pass_goes_on_from_where_the_client_has_come_to() -> None:
-    """Nothing is found twice, nothing is left out, and what is passed meanwhile is needed now."""
-    motion = driving(10.0, *ROUTE)
-    path = path_of(motion)
-    path.begin(0.0)
-    cells: list[int] = []
-    for second in range(2, 22):
-        path.look(town(), AHEAD, STEP_M)
-        path.look(town(), AHEAD, STEP_M)
-        move(motion, 10.0 * (second - 1), 0.0, float(second), ROUTE)
-        cells += [cell for _, cell in taken(path)]
-    assert len(set(cells)) == len(cells)
-    assert asked_along([(0.0, 0.0), (10.0 * 20 + 150.0, 0.0)]) <= set(cells)
-    path = path_of(motion)
-    path.begin(22.0)
-    for _ in range(4):
-        path.look(town(), AHEAD, STEP_M)
-    move(motion, motion.x + 60.0, 0.0, 27.0, ROUTE)
-    first = path.first()
-    assert first is not None
-    assert first[0] == 0.0
-
-
-def test_after_a_jump_the_pass_begins_from_the_start() -> None:
-    motion = driving(10.0, *ROUTE)
-    path = path_of(motion)
-    path.begin(0.0)
-    for _ in range(5):
-        path.look(town(), AHEAD, STEP_M)
-    for second in range(3):
-        move(motion, 1200.0 + 10.0 * second, 100.0, 10.0 + second)
-    path.area = Circle(1220.0, 100.0, RADIUS_M)
-    path.look(town(), AHEAD, STEP_M)
-    found = [cell for _, cell in taken(path)]
-    assert found
-    assert town().boxes[found][:, 0].min() > 1200.0
-
-
 def test_of_an_area_with_very_many_cells_nothing() -> None:
     huge = Catalogue.from_cells(
         (f"/{n:06}", (float(n % 200), float(n // 200), n % 200 + 1.0, n // 200 + 1.0), SourceStamp(1, 1, 1))
@@ -309,7 +261,7 @@ class Daemon:
         self.present: set[tuple[int, str]] = set()
         self.loading: set[tuple[int, str]] = set()
         self.failed: set[tuple[int, str]] = set()
-        self.prefetch = Prefetch(self.is_absent, outage_tolerance_s)
+        self.prefetch, self.reader = Prefetch(self.is_absent, outage_tolerance_s), Reader(self.is_absent)
         self.catalogue = town()
 
     def is_absent(self, index: int, layer: str) -> bool:
@@ -326,10 +278,13 @@ class Daemon:
     def next(self, now_s: float) -> Wish | None:
         """Ask until there is a wish, or none can be."""
         for _ in range(10_000):
-            wish = self.prefetch.next(self.catalogue, now_s)
-            if wish is not None or not self.prefetch.more:
+            wish = self.prefetch.next(self.catalogue, now_s, self.reader)
+            if wish is not None or self.next_s(now_s) > now_s:
                 return wish
         raise AssertionError("it never ends")
+
+    def next_s(self, now_s: float) -> float:
+        return self.prefetch.next_s(now_s, self.reader)
 
     def wishes(self, now_s: float, most: int = 100_000) -> list[Wish]:
         """Take one wish after the other, as if all were loading."""
@@ -352,9 +307,9 @@ class Daemon:
         [(-100.0, ("points",)), (100.0, ("points",))],
         [(0.0, ("points",)), (0.0, ("points",))],
         [(0.0, ("points", "ndt(leaf=2.0)"))],
-        [(number % 40 * 10.0 - 200.0, ("points",)) for number in range(3 * COMPARED_PER_TURN)],
+        [(number % 40 * 10.0 - 200.0, ("points",)) for number in range(200)],
     ],
-    ids=["one", "two", "two that need the same", "two layers", "more than a call compares"],
+    ids=["one", "two", "two that need the same", "two layers", "very many"],
 )
 def test_all_in_order_of_time_each_once(clients: list[tuple[float, tuple[str, ...]]]) -> None:
     daemon = Daemon()
@@ -365,13 +320,7 @@ def test_all_in_order_of_time_each_once(clients: list[tuple[float, tuple[str, ..
             one = Daemon()
             one.client("only", y, layers)
             alone |= {(wish.cell, wish.layer) for wish in one.wishes(1.0)}
-    calls = 1
-    while (first := daemon.prefetch.next(daemon.catalogue, 1.0)) is None:
-        assert daemon.prefetch.more
-        calls += 1
-    assert calls > len(clients) // COMPARED_PER_TURN
-    daemon.loading.add((first.cell, first.layer))
-    found = [first, *daemon.wishes(1.0)]
+    found = daemon.wishes(1.0)
     times = [wish.needed_in_s for wish in found]
     assert times == sorted(times)
     assert times[-1] > TOLERANCE_S, "what is needed after the longest outage is wished for, too"
@@ -380,7 +329,6 @@ def test_all_in_order_of_time_each_once(clients: list[tuple[float, tuple[str, ..
     assert wished >= alone
     assert len(clients) > 3 or wished == alone
     assert daemon.next(1.0) is None
-    assert not daemon.prefetch.more
 
 
 def test_clients_that_stand_or_have_left_wish_for_nothing() -> None:
@@ -394,8 +342,7 @@ def test_clients_that_stand_or_have_left_wish_for_nothing() -> None:
         move(motion, 0.0, 0.0, float(second))
     daemon.prefetch.follow("b", motion, Circle(0.0, 0.0, RADIUS_M), ("points",))
     assert daemon.next(5.0) is None
-    assert not daemon.prefetch.more
-    assert daemon.prefetch.next_s(5.0) == math.inf
+    assert daemon.next_s(5.0) == math.inf
 
 
 def test_what_has_failed_is_passed_over_and_wished_for_in_a_later_pass() -> None:
@@ -411,17 +358,78 @@ def test_what_has_failed_is_passed_over_and_wished_for_in_a_later_pass() -> None
     assert [wish.cell for wish in daemon.wishes(1.0 + PASS_S, 1)] == [first.cell]
 
 
-def test_a_pass_that_takes_longer_than_its_interval_begins_again() -> None:
+def test_what_has_failed_comes_first_in_the_next_pass() -> None:
+    """Though the list of the last one has not been read to its end."""
     daemon = Daemon(outage_tolerance_s=60.0)
     daemon.client("a")
     first = daemon.next(1.0)
     assert first is not None
     daemon.failed.add((first.cell, first.layer))
-    second = daemon.next(1.5)
+    second = daemon.next(1.1)
     assert second is not None
     assert second.cell != first.cell
     daemon.failed.clear()
-    assert [wish.cell for wish in daemon.wishes(1.0 + PASS_S, 1)] == [first.cell]
+    for _ in range(1000):
+        wish = daemon.next(1.0 + LONGEST_PASS_S)
+        assert wish is not None
+        if wish.cell == first.cell:
+            break
+    else:
+        raise AssertionError("it never comes")
+
+
+def test_after_a_jump_another_pass_begins_soon() -> None:
+    """And until then nothing is wished for on its old path; nor when the client has left."""
+    daemon = Daemon()
+    motion = daemon.client("a")
+    daemon.client("b", y=200.0)
+    assert len(daemon.wishes(1.0, 5)) == 5
+    move(motion, 1200.0, -300.0, 1.1)
+    move(motion, 1210.0, -300.0, 2.1)
+    daemon.prefetch.follow("a", motion, Circle(1210.0, -300.0, RADIUS_M), ("points",))
+    now_s = 1.0 + 0.9 * PASS_S
+    on_old_list = daemon.wishes(now_s)
+    assert on_old_list
+    assert min(town().box(wish.cell)[1] for wish in on_old_list) > 200.0 - 2.0 * RADIUS_M
+    assert daemon.next_s(now_s) == 1.0 + PASS_S
+    found = daemon.wishes(1.0 + PASS_S)
+    assert found
+    assert all(town().box(wish.cell)[0] > 1200.0 for wish in found)
+    assert daemon.next_s(2.0) == 1.0 + 2.0 * PASS_S
+    daemon.loading.clear()
+    assert daemon.next(1.9) is None, "the list has been read"
+
+
+def test_in_an_outage_a_list_that_has_been_read_is_left_alone() -> None:
+    """Whether loads fail, or succeed from the disk."""
+    for failed in (True, False):
+        daemon = Daemon()
+        daemon.client("a")
+        assert daemon.wishes(1.0)
+        daemon.prefetch.health.unreachable = True
+        daemon.prefetch.health.ended(0.1, failed=failed)
+        assert daemon.next(1.1) is None
+        assert daemon.next_s(1.1) >= 1.0 + PROBE_S
+
+
+def test_two_readers_of_one_list_lack_different_cells() -> None:
+    """What a client that has left would have needed is lacked by none."""
+    daemon = Daemon()
+    daemon.client("a")
+    everything = daemon.wishes(1.0)
+    on_disk = {(wish.cell, wish.layer) for wish in everything[::2]}
+    disk = Reader(lambda index, layer: (index, layer) not in on_disk)
+    found: list[Wish] = []
+    daemon.reader = disk
+    while (wish := daemon.next(1.1)) is not None:
+        assert wish.needed_in_s == pytest.approx(max(0.0, everything[2 * len(found) + 1].needed_in_s - 0.1))
+        on_disk.add((wish.cell, wish.layer))
+        found.append(wish)
+    assert [wish.cell for wish in found] == [wish.cell for wish in everything[1::2]]
+    daemon.reader = Reader(lambda _index, _layer: True)
+    assert daemon.next(1.2) is not None
+    del daemon.prefetch.paths["a"]
+    assert daemon.next(1.2) is None
 
 
 def test_without_a_route_outages_are_prepared_for_after_the_first() -> None:
@@ -484,12 +492,48 @@ def test_one_call_looks_at_little() -> None:
         daemon.client(str(number), y=5.0 * number - 100.0)
     daemon.present = {(index, "points") for index in range(len(counted))}
     calls = 0
-    while not calls or daemon.prefetch.more:
+    while not calls or daemon.next_s(1.0) == 1.0:
         before = Counted.asked
-        assert daemon.prefetch.next(counted, 1.0) is None
-        assert Counted.asked - before <= 4 * LOOKS_PER_WISH  # where it is, and three paths ahead
+        assert daemon.prefetch.next(counted, 1.0, daemon.reader) is None
+        assert Counted.asked - before <= 4 * LOOKS_PER_CALL  # where it is, and three paths ahead
         calls += 1
-    assert calls >= 40 * TOLERANCE_S * 10.0 / 10.0 / LOOKS_PER_WISH
+    assert calls >= 40 * TOLERANCE_S * 10.0 / 10.0 / LOOKS_PER_CALL
+
+
+def test_one_call_passes_over_few() -> None:
+    """However much of the list has been loaded since it was made."""
+    daemon = Daemon(outage_tolerance_s=60.0)
+    daemon.client("a")
+    assert daemon.next(1.0) is not None
+    asked = 0
+
+    def lacks(_index: int, _layer: str) -> bool:
+        nonlocal asked
+        asked += 1
+        return False
+
+    reader, calls = Reader(lacks), 0
+    while not calls or daemon.prefetch.next_s(1.0, reader) == 1.0:
+        asked, calls = 0, calls + 1
+        assert daemon.prefetch.next(daemon.catalogue, 1.0, reader) is None
+        assert asked <= READ_PER_CALL
+    assert calls > 3
+
+
+def test_of_very_many_cells_those_needed_first_are_listed_and_the_others_later(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(look_ahead, "MAX_LISTED", 20)
+    daemon, all_at_once = Daemon(), Daemon()
+    daemon.client("a")
+    found = daemon.wishes(1.0)
+    assert len(found) == 20
+    assert daemon.next_s(1.0) == 1.0 + PASS_S
+    for number in range(1, 20):
+        found += daemon.wishes(1.0 + number * PASS_S)
+    monkeypatch.undo()
+    all_at_once.client("a")
+    assert [wish.cell for wish in found] == [wish.cell for wish in all_at_once.wishes(1.0)]
 
 
 steps = st.lists(

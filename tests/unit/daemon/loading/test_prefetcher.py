@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S
+from shmmap.daemon.cache.eviction_plan import HAND_OUT_GRACE_S
 from shmmap.daemon.loading.loads import PREFETCH, Attempt, Load, Purpose
 from shmmap.daemon.loading.look_ahead import IN_A_ROW, URGENT_S
 from shmmap.daemon.loading.prefetcher import FULL_S, KEPT, MAX_PATHS

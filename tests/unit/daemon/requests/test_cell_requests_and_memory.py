@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from shmmap.daemon.cache.evictor import Freeing
 from shmmap.daemon.loading.room import AHEAD_SHARE, Room
 from shmmap.daemon.records import Key
 from shmmap.protocol.messages import (
@@ -79,7 +80,7 @@ def test_looking_for_room_where_others_map_everything_comes_to_an_end(
         for _ in range(3):
             one.offset_s += 5.0
             looks = 0
-            while one.evictor.free(1 << 30, one.now_s()):
+            while one.evictor.free(1 << 30, one.now_s()) is not Freeing.NO_MORE:
                 looks += 1
                 assert looks < 10
                 one.scheduler.room.on_closes(one.now_s())

@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which segments are evicted next: a list of those that clients will need last, without any I/O.
+
+All residents are looked at, some in each step, and at most `MAX_LISTED` are listed.  The list is not kept up
+to date: whether a segment may still be evicted is asked again when its turn comes
+(`shmmap.daemon.cache.evictor`), and another list is made while clients move and memory is short.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from bisect import insort
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import count, islice
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap.daemon.records import Resident
+from shmmap.daemon.travel.places import NOWHERE, PAIRS_PER_BLOCK, Places, until_needed
+
+MAX_LISTED: Final = 2048
+BLOCK: Final = 64
+"""Segments looked at in a step: 0.1 to 0.2 ms; fewer where there are many places."""
+HAND_OUT_GRACE_S: Final = 1.0
+"""A segment that was just handed out is not evicted for this long, so that its reader can open it."""
+MAX_SCORE: Final = 1e12
+"""Score of what will never be needed; finite, so that scores can be compared."""
+SPARE_SCORE: Final = 1e15
+"""Added to the score of what was loaded into spare memory."""
+SOON_S: Final = 30.0
+"""Added to the time until a segment is needed; without it, size would not matter for those needed soon."""
+
+
+def eviction_scores(some: Sequence[Resident], places: Places, now_s: float) -> NDArray[np.float64]:
+    """Score segments, (N,): the highest is evicted first; among equals, the one unused for longest.
+
+    The score is the time until a segment is needed (s), weighted by the square root of its size: of the
+    exponents tried, this one saved most bytes of loading where sizes differ.  Without any place the least
+    recently used segment is evicted first.  Requested, prefetched and computed segments are scored alike;
+    what was loaded into spare memory goes before all others.
+
+    Parameters
+    ----------
+    places
+        Present and future positions of the clients.
+    """
+    spare = SPARE_SCORE * np.array([resident.spare for resident in some], dtype=np.float64)
+    if not len(places):
+        return spare - np.array([resident.last_use_s for resident in some], dtype=np.float64)
+    boxes = np.array([resident.box for resident in some]).reshape(-1, 4)
+    sizes = np.array([resident.nbytes for resident in some], dtype=np.float64)
+    scores: NDArray[np.float64] = (until_needed(boxes, places, now_s) + SOON_S) * np.sqrt(sizes)
+    return np.minimum(scores, MAX_SCORE) + spare
+
+
+class Candidate(NamedTuple):
+    """A segment that may be evicted; the greatest candidate goes first.  Numbers are unique.
+
+    Segments in their grace come last, the first whose grace ends in front; before them, those that a session
+    reports to hold, since most likely a process has them mapped.
+    """
+
+    is_past_grace: bool
+    is_unclaimed: bool
+    score: float
+    unused: float
+    number: int
+    resident: Resident
+
+
+_numbers = count()
+
+
+@dataclass(eq=False, slots=True)
+class EvictionPlan:
+    """The candidates of one look at all residents.
+
+    Attributes
+    ----------
+    places, now_s
+        Positions of clients by which segments are scored, and when.
+    places_version
+        Of the positions, see `shmmap.daemon.transport.sessions.Sessions`.
+    listed
+        The candidates, the one that goes first at the end.
+    is_whole
+        Whether all candidates were listed.
+    """
+
+    places: Places = field(default_factory=lambda: NOWHERE)
+    places_version: int = -1
+    now_s: float = -math.inf
+    listed: list[Candidate] = field(default_factory=list)
+    is_whole: bool = True
+
+    def make(self, residents: Iterator[Resident], may_go: Callable[[Resident], bool]) -> Iterator[None]:
+        """Look at all residents, some in each step, and list those that may go."""
+        block = min(BLOCK, 2 * PAIRS_PER_BLOCK // max(1, len(self.places)))
+        heap: list[Candidate] = []
+        while some := list(islice(residents, block)):
+            for one in self._candidates(some):
+                if len(heap) == MAX_LISTED and one < heap[0]:
+                    self.is_whole = False
+                elif may_go(one.resident):
+                    heapq.heappush(heap, one)
+                    if len(heap) > MAX_LISTED:
+                        heapq.heappop(heap)
+                        self.is_whole = False
+            if len(some) == block:
+                yield
+        self.listed = sorted(heap)
+
+    def add(self, some: Sequence[Resident]) -> None:
+        """List some more."""
+        self.listed += self._candidates(some)
+        self.listed.sort()
+
+    def first(self) -> Candidate | None:
+        """Return the candidate that goes first; what was used since it was listed goes last."""
+        while self.listed:
+            one = self.listed[-1]
+            unused = -one.resident.last_use_s
+            if unused == one.unused:
+                return one
+            del self.listed[-1]
+            insort(self.listed, one._replace(is_past_grace=False, score=0.0, unused=unused))
+        return None
+
+    def score(self, resident: Resident) -> float:
+        """Return the score that a segment would have had."""
+        return float(eviction_scores([resident], self.places, self.now_s)[0])
+
+    def _candidates(self, some: Sequence[Resident]) -> Iterator[Candidate]:
+        scores: list[float] = eviction_scores(some, self.places, self.now_s).tolist()
+        for resident, score in zip(some, scores, strict=True):
+            unused = -resident.last_use_s
+            is_past_grace = self.now_s - resident.last_use_s >= HAND_OUT_GRACE_S
+            rank = (is_past_grace, not resident.sessions, is_past_grace and score, unused)
+            yield Candidate(*rank, next(_numbers), resident)
