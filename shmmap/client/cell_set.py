@@ -3,13 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, overload
 
 import numpy as np
 
 from shmmap.client.cell import Cell
-from shmmap.errors import BadRequest, CellError, ShmmapError
+from shmmap.errors import BadRequest, CellError, ShmmapError, UnknownCell
 from shmmap.protocol.messages import FailedCell, HeldCell
 
 if TYPE_CHECKING:
@@ -53,8 +53,7 @@ class CellSet(Sequence[Cell]):
         may still turn out to exist: ask again.
     reason : str
         Why missing cells are not being loaded: ``"offline"`` if the list of cells cannot be reached at
-        present.  Empty if the list is being fetched, if everything is covered, or if the daemon is older than
-        protocol 1.6.
+        present.  Empty if the list is being fetched, or if everything is covered.
     """
 
     __slots__ = (
@@ -163,6 +162,52 @@ class CellSet(Sequence[Cell]):
 
     def __getitem__(self, index: int | slice) -> Cell | tuple[Cell, ...]:
         return self.cells[index]
+
+
+def joined(parts: Sequence[CellSet]) -> CellSet:
+    """Join the answers to the parts of one request; removals are those of the last part that has any.
+
+    The map may change between two of them: the state named is the first, after which all that changed is new.
+    """
+    return CellSet(
+        tuple(cell for part in parts for cell in part.cells),
+        tuple(error for part in parts for error in part.failed),
+        tuple(cell for part in parts for cell in part.pending),
+        next((part.removed for part in reversed(parts) if part.removed), ()),
+        parts[-1].epoch,
+        parts[0].map_version,
+        parts[-1].layers,
+        all(part.covered for part in parts),
+        next((part.reason for part in parts if part.reason), ""),
+    )
+
+
+def in_id_order(parts: Sequence[CellSet]) -> CellSet:
+    """Join the answers to the parts of a request by area; of a layer that came twice, the last counts."""
+    whole = joined(parts)
+    order = {layer: place for place, layer in enumerate(whole.layers)}
+    last = {(cell.id, order.get(cell.layer, 0)): cell for cell in whole.cells}
+    whole.cells = tuple(last[key] for key in sorted(last))
+    return whole
+
+
+def without_pending(part: CellSet) -> CellSet:
+    """Return an answer of which everything pending was requested again."""
+    part.pending = ()
+    return part
+
+
+def only(part: CellSet, layers: Container[tuple[str, str]]) -> CellSet:
+    """Return some layers of an answer by id, less those of cells that have left the map."""
+    part.cells = tuple(cell for cell in part.cells if (cell.id, cell.layer) in layers)
+    part.pending = tuple(cell for cell in part.pending if (cell.id, cell.layer) in layers)
+    part.failed = tuple(
+        error
+        for error in part.failed
+        if (error.cell_id, error.layer) in layers and not isinstance(error, UnknownCell)
+    )
+    part.covered = True
+    return part
 
 
 def gather(

@@ -281,7 +281,8 @@ class CellCache:
         list
             Unused tables, to be freed in steps: freeing many entries at once takes long.
         """
-        left: list[ShardedDict[int, Any]] = [*self.warm.layers.values(), *self.layers.forget()]
+        left: list[ShardedDict[int, Any]] = list(self.warm.layers.values())
+        self.layers.forget()
         self.catalogue = new
         self.warm = self.warm.successor()
         if changed is None:

@@ -129,11 +129,8 @@ class Dispatch:
             if message.intent is not None:
                 check_intent(message.intent)
                 session.state_intent(message.intent)
-            if isinstance(message, messages.Differential):
-                return self.cells.differential(session, message)
-            if isinstance(message, messages.Area):
-                return self.cells.area(session, message)
-            return self.cells.selected(session, message)
+            self.cells.serve(session, message)
+            return None
         if isinstance(message, messages.Release):
             return self._release(session, message)
         if isinstance(message, OPERATOR_REQUESTS):

@@ -138,8 +138,7 @@ class InnerDaemon:
 
     def ask(self, session: Session, message: Area | Differential | Selected) -> None:
         """Begin to serve a request for cells, and do what of it needs no waiting."""
-        verb = getattr(self.cells, type(message).__name__.lower())
-        finish(verb(session, message))
+        self.cells.serve(session, message)
 
     def now_s(self) -> float:
         """Return the time of the daemon's clock."""
@@ -169,7 +168,7 @@ class InnerDaemon:
         self.scheduler.pump(now_s)
         while self.scheduler.unfinished:
             self.scheduler.pump(now_s)
-        self.cells.answer_overdue(now_s)
+        self.cells.answer_due(now_s)
         self.map_switch.run_step(now_s)
         if self.scheduler.prefetcher.next_s <= now_s:
             self.scheduler.prefetcher.run_step(now_s)
@@ -191,7 +190,7 @@ class InnerDaemon:
 
     def run_until_nothing_waits(self) -> None:
         """Turn until no request waits; nothing may be kept for any."""
-        self.run_until(lambda: self.cells.next_deadline_s() == math.inf)
+        self.run_until(lambda: self.cells.next_s() == math.inf)
         assert (list(self.ledger.needed()), self.waiting._of_load, len(self.cells)) == ([], {}, 0)
 
     def reply_to(self, request: int) -> Any:
