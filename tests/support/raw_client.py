@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import struct
+import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -171,7 +172,7 @@ class RawClient:
 
     def hello(self) -> list[Any]:
         """Open the session."""
-        welcome = self.ask("hello", 2, 0, self.name)
+        welcome = self.ask("hello", 3, 0, self.name)
         assert welcome[0] == "welcome"
         (
             _,
@@ -226,9 +227,28 @@ class RawClient:
             self.last_bytes,
         )
 
+    def all_cells(self, wait: float | None, tag: str, *elements: Any) -> RawCells:
+        """Ask reply after reply, and from the beginning while something is pending and ``wait`` lasts."""
+        end_s = time.monotonic() + (wait or 0.0)
+        while True:
+            parts: list[RawCells] = []
+            start = ""
+            while start or not parts:
+                reply = self.ask(tag, *elements, start)
+                parts.append(self.cells_reply(reply))
+                start = reply[12]
+            *_, last = parts
+            last.map_version = parts[0].map_version
+            last.cells = [cell for part in parts for cell in part.cells]
+            last.pending = [cell for part in parts for cell in part.pending]
+            last.failed = [cell for part in parts for cell in part.failed]
+            last.wire_bytes = sum(part.wire_bytes for part in parts)
+            if len(parts) == 1 or not last.pending or time.monotonic() >= end_s:
+                return last
+
     def area(self, area: list[Any], *, wait: float | None = 30.0, intent: Any = None) -> RawCells:
         """Ask for an area."""
-        return self.cells_reply(self.ask("area", area, ["points"], wait, intent))
+        return self.all_cells(wait, "area", area, ["points"], wait, intent)
 
     def differential(
         self,
@@ -240,9 +260,8 @@ class RawClient:
         intent: Any = None,
     ) -> RawCells:
         """Ask for an area less what is held; ``held`` rows are [id], [id, version], ..."""
-        return self.cells_reply(
-            self.ask("differential", area, ["points"], held or [], pack_versions(packed or []), wait, intent)
-        )
+        versions = pack_versions(packed or [])
+        return self.all_cells(wait, "differential", area, ["points"], held or [], versions, wait, intent)
 
     def selected(self, ids: list[str], *, wait: float | None = 30.0) -> RawCells:
         """Ask for cells by id."""

@@ -41,7 +41,7 @@ MAX_CELLS: Final = 512
 MAX_COLD: Final = 128
 """Layers of cells among them that are not in memory (one takes some 18 us)."""
 MAX_ATTEMPTS: Final = 4
-"""Attempts after which a request is answered with what is there, besides those after a page of the map."""
+"""Attempts that may end in waiting, besides those after a page of the map; the next one is the answer."""
 MAX_WAIT_S: Final = 3600.0
 MAX_COMPARED: Final = 4096
 """Cells of an area that are compared with those that a client holds, if all are in memory."""

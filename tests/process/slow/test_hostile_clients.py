@@ -270,7 +270,7 @@ for number in range(4200):
     one = context.socket(zmq.DEALER)
     one.linger = 0
     one.connect("ipc://" + path)
-    one.send(pack(["hello", 1, 2, 0, "crowd"]))
+    one.send(pack(["hello", 1, 3, 0, "crowd"]))
     assert one.poll(60000)
     one.close()
 done()
@@ -292,7 +292,7 @@ one.settimeout(20.0)
 def send(message):
     body = pack(message)
     one.sendall(b"\\x02" + struct.pack(">Q", len(body)) + body)
-send(["hello", 1, 2, 0, "deaf"])
+send(["hello", 1, 3, 0, "deaf"])
 names = ["0_0.pcd"] * 3000
 try:
     while True:

@@ -30,15 +30,15 @@ def test_a_client_of_1_x_is_refused_and_stays_connected(
 ) -> None:
     client = PlainClient(daemon(divided_map.root).endpoint)
     client.send_frame(HELLO_OF_1_5)
-    said = "client speaks protocol 1.5, daemon 2.2"
+    said = "client speaks protocol 1.5, daemon 3.0"
     assert client.message() == ["error", 7, "protocol_mismatch", said, "update the client, and restart it"]
     assert client.hello()[0] == "welcome"
     client.close()
 
 
 def test_a_daemon_of_1_x_is_named(shmmap: Verbs, short_path: Path) -> None:
-    """It answers a hello of 2.2 as 1.5 did: an error whose elements have not changed since."""
-    path, said = short_path / "old.sock", "client speaks protocol 2.2, daemon 1.5"
+    """It answers a hello of 3.0 as 1.5 did: an error whose elements have not changed since."""
+    path, said = short_path / "old.sock", "client speaks protocol 3.0, daemon 1.5"
     asked: list[Any] = []
 
     def refuse() -> None:
@@ -68,7 +68,7 @@ def test_a_daemon_of_1_x_is_named(shmmap: Verbs, short_path: Path) -> None:
     finally:
         context.term()
         daemon.join()
-    assert {(tag, *version) for tag, version in asked} == {("hello", 2, 2)}
+    assert {(tag, *version) for tag, version in asked} == {("hello", 3, 0)}
     assert said in stop
     assert f"a signal ends a daemon of any version: kill {os.getpid()}" in stop
     for text in printed:
