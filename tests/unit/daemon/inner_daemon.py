@@ -17,6 +17,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.loading.link import Link
 from shmmap.daemon.map_in_memory import FetchedFrom, MapInMemory
@@ -52,6 +54,17 @@ EVERYWHERE = BoxMessage(-1e4, -1e4, 1e4, 1e4)
 def names(reply: Cells) -> list[str]:
     """File names of the cells that a reply has, in its order."""
     return [Path(cell.id).name for cell in reply.cells]
+
+
+def joined(parts: list[Cells]) -> Cells:
+    """Return the replies to one request as one."""
+    return msgspec.structs.replace(
+        parts[-1],
+        map_version=parts[0].map_version,
+        cells=tuple(cell for part in parts for cell in part.cells),
+        pending=tuple(cell for part in parts for cell in part.pending),
+        failed=tuple(cell for part in parts for cell in part.failed),
+    )
 
 
 def finish(work: Iterator[None] | None) -> None:
@@ -215,9 +228,28 @@ class InnerDaemon:
         self.ask(session or self.session(), message)
         return self.cells_of(message.request)
 
+    def parts_for(self, message: Area | Differential, session: Session | None = None) -> Iterator[Cells]:
+        """Serve a request reply after reply."""
+        session, start = session or self.session(), ""
+        while True:
+            known = len(self.replies)
+            self.ask(session, msgspec.structs.replace(message, start=start))
+            self.run_until(lambda known=known: len(self.replies) > known)  # type: ignore[misc]
+            (part,) = (reply for _, reply in self.replies[known:] if reply.request == message.request)
+            yield part
+            if not (start := part.next):
+                return
+
+    def all_for(self, message: Area | Differential, session: Session | None = None) -> Cells:
+        """Serve a request reply after reply, and anew until nothing is pending; return all cells."""
+        while True:
+            whole = joined(list(self.parts_for(message, session)))
+            if not whole.pending:
+                return whole
+
     def everything(self, request: int = 1) -> Cells:
         """Ask for all cells and wait for them."""
-        return self.cells_for(Area(request, EVERYWHERE, wait=600.0))
+        return self.all_for(Area(request, EVERYWHERE, wait=600.0))
 
     def listed(self) -> list[CellRow]:
         """All that is in memory, as clients list it."""

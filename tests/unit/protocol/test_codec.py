@@ -252,6 +252,4 @@ def test_any_number_of_handles(count: int) -> None:
 def test_any_number_of_removed_ids(count: int) -> None:
     removed = ("x",) * count
     assert encode_cells(1, 2, 3, (), removed, b"", ()) == encode(Cells(1, 2, 3, (), removed))
-    assert encode_cells(1, 2, 3, (), (), bytes(count), ()) == encode(
-        Cells(1, 2, 3, (), (), bytes(count))
-    )
+    assert encode_cells(1, 2, 3, (), (), bytes(count), ()) == encode(Cells(1, 2, 3, (), (), bytes(count)))
