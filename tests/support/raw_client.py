@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import struct
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import zmq
@@ -25,6 +25,10 @@ HANDLE = (
     "max_x",
     "max_y",
 )
+
+
+SELECTED = 128
+"""As many cells as one request names."""
 
 
 @dataclass
@@ -93,6 +97,19 @@ def circle(x: float, y: float, radius: float, z: tuple[float, float] | None = No
 def square(x: float, y: float, radius: float) -> list[Any]:
     """Autoware's square on the wire."""
     return ["square", x, y, radius]
+
+
+def joined(parts: list[RawCells]) -> RawCells:
+    """The replies to the parts of one request, as one."""
+    *_, last = parts
+    return replace(
+        last,
+        map_version=parts[0].map_version,
+        cells=[cell for part in parts for cell in part.cells],
+        pending=[cell for part in parts for cell in part.pending],
+        failed=[cell for part in parts for cell in part.failed],
+        wire_bytes=sum(part.wire_bytes for part in parts),
+    )
 
 
 class RawClient:
@@ -237,14 +254,9 @@ class RawClient:
                 reply = self.ask(tag, *elements, start)
                 parts.append(self.cells_reply(reply))
                 start = reply[12]
-            *_, last = parts
-            last.map_version = parts[0].map_version
-            last.cells = [cell for part in parts for cell in part.cells]
-            last.pending = [cell for part in parts for cell in part.pending]
-            last.failed = [cell for part in parts for cell in part.failed]
-            last.wire_bytes = sum(part.wire_bytes for part in parts)
-            if len(parts) == 1 or not last.pending or time.monotonic() >= end_s:
-                return last
+            whole = joined(parts)
+            if len(parts) == 1 or not whole.pending or time.monotonic() >= end_s:
+                return whole
 
     def area(self, area: list[Any], *, wait: float | None = 30.0, intent: Any = None) -> RawCells:
         """Ask for an area."""
@@ -264,8 +276,9 @@ class RawClient:
         return self.all_cells(wait, "differential", area, ["points"], held or [], versions, wait, intent)
 
     def selected(self, ids: list[str], *, wait: float | None = 30.0) -> RawCells:
-        """Ask for cells by id."""
-        return self.cells_reply(self.ask("selected", ids, ["points"], wait))
+        """Ask for cells by id, some at a time."""
+        parts = [ids[at : at + SELECTED] for at in range(0, len(ids), SELECTED)] or [[]]
+        return joined([self.cells_reply(self.ask("selected", part, ["points"], wait)) for part in parts])
 
     def release(self, versions: list[int] | None = None) -> None:
         """Report to the daemon what was unmapped."""
