@@ -143,7 +143,6 @@ def test_a_cancelled_wait_leaves_its_place(
 ) -> None:
     one = daemon(divided_map.root, "--workers", "1")
     client = connect(one)
-    assert client.minor >= 1
     client.selected(["-60_-60.pcd"])  # starts the loader
     stopped = one.stop_loaders()
     ask = partial(client.send, "area", circle(0, 0, 5), ["points"], 60.0)
