@@ -38,7 +38,7 @@ from shmmap.protocol.endpoint import SYSTEM_RUNTIME_DIR
 from shmmap.segment.attach import attach
 from tests.support.cpp_client import CppClient
 from tests.support.daemon_process import DaemonProcess, Deadline, open_files
-from tests.support.divided_map import DividedMap, random_points
+from tests.support.divided_map import DividedMap, make_map, random_points
 from tests.support.process_costs import descriptors
 from tests.support.segment_reader import names
 
@@ -99,6 +99,35 @@ def test_the_first_program(
     monkeypatch.setenv("SHMMAP_ENDPOINT", standing.endpoint)
     cells = shmmap.connect().around(3.0, 4.0, radius=50)
     assert sum(len(cell.xyz) for cell in cells) == 500 * len(standing_map.in_circle(3.0, 4.0, 50))
+
+
+@BOTH
+def test_more_cells_than_one_reply_has(daemon: Factory, connect: Connect, tmp_path: Path) -> None:
+    """A client goes on by itself, and what it returns is the whole, in order."""
+    made = make_map(tmp_path / "many", columns=24, rows=24, points=5)
+    every, layers = sorted(map(made.id, made.corners)), ("voxel(leaf=1.0)", "points")
+    everywhere = shmmap.Box(-1e4, -1e4, 1e4, 1e4)
+    with connect(daemon(made.root).endpoint) as client:
+        cold = client.area(everywhere, wait=0.0)
+        assert {cell.id for cell in cold.pending} | {cell.id for cell in cold.cells} == set(every)
+        whole = client.area(everywhere, wait=300.0)
+        assert [cell.id for cell in whole.cells] == every
+        assert (whole.pending, whole.failed, whole.complete) == ((), (), True)
+        two = client.area(everywhere, layers, wait=300.0)
+        assert [(cell.id, cell.layer) for cell in two] == [
+            (cell, layer) for cell in every for layer in layers
+        ]
+        lacked = client.differential(everywhere, whole.cells[::3], wait=300.0)
+        assert [cell.id for cell in lacked] == [cell for at, cell in enumerate(every) if at % 3]
+        assert lacked.removed == ()
+        part = client.differential(shmmap.Box(-1e4, -1e4, -1.0, 1e4), whole.cells, wait=300.0)
+        assert (len(part.cells), len(part.removed)) == (0, 24 * 12 - 24)
+        ids = [*every[::-1], *every[:50], "no such cell", "0_0.pcd"]
+        some = client.selected(ids, layers, wait=300.0)
+        assert [(cell.id, cell.layer) for cell in some] == [
+            (made.id(Path(cell).name), layer) for cell in ids if cell != "no such cell" for layer in layers
+        ]
+        assert [error.code for error in some.failed] == ["unknown_cell"] * 2
 
 
 def test_everything_says_what_it_is(standing: DaemonProcess, standing_map: DividedMap) -> None:
