@@ -46,7 +46,7 @@ def check_count(count: int) -> None:
     if count > MAX_CELLS:
         raise BadRequest(
             f"more than {MAX_CELLS} cells in one request",
-            hint="ask for a smaller area",
+            hint="ask for a smaller area, or for some ids at a time",
         )
 
 

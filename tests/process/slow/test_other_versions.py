@@ -10,6 +10,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
+import pytest
 import zmq
 
 from tests.process.conftest import DaemonFactory
@@ -18,20 +19,22 @@ from tests.support.divided_map import DividedMap
 from tests.support.message_pack import pack, unpack
 from tests.support.plain_client import PlainClient
 
-HELLO_OF_1_5 = bytes.fromhex("95 a568656c6c6f 07 01 05 a36f6c64")
-"""What a client of 1.5 that is called "old" begins with, as request 7."""
+HELLO = bytes.fromhex("95 a568656c6c6f 07")
+"""What a hello begins with, as request 7; major, minor and the client's name follow."""
 VERBS = (("query", "--circle", "0,0,5"), ("status",), ("ls",))
 """Verbs that ask the daemon, and verbs that read its statistics, where it can be found only by its socket."""
 TIMEOUT_S = 60.0
 
 
-def test_a_client_of_1_x_is_refused_and_stays_connected(
-    daemon: DaemonFactory, divided_map: DividedMap
+@pytest.mark.parametrize(("major", "minor"), [(1, 5), (2, 0), (2, 2)])
+def test_an_older_client_is_refused_and_stays_connected(
+    daemon: DaemonFactory, divided_map: DividedMap, major: int, minor: int
 ) -> None:
     client = PlainClient(daemon(divided_map.root).endpoint)
-    client.send_frame(HELLO_OF_1_5)
-    said = "client speaks protocol 1.5, daemon 3.0"
-    assert client.message() == ["error", 7, "protocol_mismatch", said, "update the client, and restart it"]
+    client.send_frame(HELLO + bytes((major, minor)) + b"\xa3old")
+    said = f"client speaks protocol {major}.{minor}, daemon 3.0"
+    hint = "update the client, and restart it; until then it keeps the cells that it has mapped"
+    assert client.message() == ["error", 7, "protocol_mismatch", said, hint]
     assert client.hello()[0] == "welcome"
     client.close()
 
