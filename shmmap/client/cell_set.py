@@ -44,7 +44,7 @@ class CellSet(Sequence[Cell]):
     epoch : int
         Identifier of the daemon run that answered.
     map_version : int
-        State of the map that the reply describes.
+        State of the map that the reply describes; of several replies to one request the first one's.
     layers : tuple of str
         The requested layers, in order, under the names that `Cell.layer` uses.
     covered : bool

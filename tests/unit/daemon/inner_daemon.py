@@ -246,6 +246,7 @@ class InnerDaemon:
             whole = joined(list(self.parts_for(message, session)))
             if not whole.pending:
                 return whole
+            self.turn()
 
     def everything(self, request: int = 1) -> Cells:
         """Ask for all cells and wait for them."""
