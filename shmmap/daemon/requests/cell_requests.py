@@ -63,7 +63,7 @@ class _Found:
     cells
         Catalogue index and layer of each handle to send, in reply order.
     next_id
-        Id of the cell after which the client has to go on; empty if these are all.
+        Id of the cell after which the client has to go on, as replies carry it; empty if these are all.
     covered, reason
         Whether all cells of the requested area are known; if not, why the request does not wait for the rest.
     pages
@@ -176,7 +176,7 @@ class CellRequests:
         if len(layers) > 1 or message.start or area is None or area.z is not None:
             return False
         cells, covered = cache.catalogue.query(area, MAX_COMPARED)
-        looks_around = cache.pages is not None and cache.layers.halo_m(layers) > 0.0
+        looks_around = cache.catalogue.pages is not None and cache.layers.halo_m(layers) > 0.0
         if not covered or looks_around or len(cells) > MAX_COMPARED:
             return False
         warm: WarmDifference | None = warm_difference(cache, message, cells, layers[0])
@@ -218,7 +218,7 @@ class CellRequests:
             end = min(len(cells), start + max(1, MAX_CELLS // len(layers)))
             found.cells = [(index, layer) for index in cells[start:end].tolist() for layer in layers]
         if end < len(cells):
-            found.next_id = self._cache.catalogue.id(int(cells[end - 1]))
+            found.next_id = self._wire_id(int(cells[end - 1]))
         return found
 
     def _find_selected(self, message: Selected, layers: Sequence[str], found: _Found) -> None:
@@ -249,6 +249,9 @@ class CellRequests:
             found.reason = "offline" if len(found.pages) < len(absent) else ""
             pages.want(needed, 0.0)
         return cells if area.z is None else cache.heights.overlapping(cells, area.z)
+
+    def _wire_id(self, index: int) -> str:
+        return self._cache.wire_id(self._cache.catalogue.id(index))
 
     def _place_after(self, cell_id: str, cells: NDArray[np.intp]) -> int:
         """Return the place of the first cell behind an id, in id order."""
@@ -353,7 +356,7 @@ class CellRequests:
         cells = found.cells
         while cells[place - 1][0] == cells[place][0]:
             place -= 1
-        found.next_id = self._cache.catalogue.id(cells[place - 1][0])
+        found.next_id = self._wire_id(cells[place - 1][0])
         del cells[place:]
 
     def _look_up_cold(
@@ -413,7 +416,7 @@ class CellRequests:
             message.request, cache.epoch, cache.catalogue.map_version, answer.handles,
             found.removed if is_last else (), found.removed_packed if is_last else b"",
             limits.layers_named(message.layers), covered=found.covered, pending=answer.pending,
-            failed=answer.failed, reason=found.reason, next_id=cache.wire_id(found.next_id),
+            failed=answer.failed, reason=found.reason, next_id=found.next_id,
         )  # fmt: skip
         session.connection.reply(reply)
 
