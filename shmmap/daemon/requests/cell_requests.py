@@ -322,22 +322,14 @@ class CellRequests:
             residents.append(resident)
         del residents[len(cells) :]
         del cold[residents.count(None) :]
-        sizes = [
-            cache.estimate(*cell) if resident is None else resident.nbytes
-            for cell, resident in zip(cells, residents, strict=True)
-        ]
-        refused = self._quota.refused(
-            request.session, cells, sizes, lambda some: self._distances_m(request, some)
-        )
-        for key in refused - request.refused:
-            cache.events.refused_by_quota(key, now_s)
-        request.refused = refused
         if cold:
             keys = (cache.key(*cell) for cell in cold)
             limits.check_queue(self._scheduler.loads, request.session.asker, keys)
-        if not request.attempts and not request.is_spare:
-            self._statistics.add("hits", len(cells) - len(cold))
-            self._statistics.add("misses", len(cold))
+        if not request.attempts:
+            self._check_quota(request, cells, residents, now_s)
+            if not request.is_spare:
+                self._statistics.add("hits", len(cells) - len(cold))
+                self._statistics.add("misses", len(cold))
         answer = _Answer()
         answer.failed = [
             FailedCell(cell_id, layer, "unknown_cell", "the map has no such cell")
@@ -345,11 +337,30 @@ class CellRequests:
         ]
         distances = self._distances_m(request, cells) if cold else [0.0] * len(cells)
         for cell, resident, distance in zip(cells, residents, distances, strict=True):
-            if resident is not None and not refused:
+            if resident is not None and not request.refused:
                 answer.add(resident)
             else:
                 self._look_up_cold(request, found, answer, cell, resident, distance, now_s)
         return answer
+
+    def _check_quota(
+        self,
+        request: CellRequest,
+        cells: Sequence[tuple[int, str]],
+        residents: Sequence[Resident | None],
+        now_s: float,
+    ) -> None:
+        """Refuse the cells that exceed the session's quota; what is refused stays so until the answer."""
+        sizes = [
+            self._cache.estimate(*cell) if resident is None else resident.nbytes
+            for cell, resident in zip(cells, residents, strict=True)
+        ]
+        refused = self._quota.refused(
+            request.session, cells, sizes, lambda some: self._distances_m(request, some)
+        )
+        for key in refused - request.refused:
+            self._cache.events.refused_by_quota(key, now_s)
+        request.refused = refused
 
     def _cut(self, found: _Found, place: int) -> None:
         """Leave the cells from a place on, with all layers of the cell there, to the next request."""
