@@ -569,11 +569,14 @@ def test_a_request_that_no_daemon_takes_is_refused_before_it_is_sent(standing: D
     """It would end the connection; the error names the limit, and the client goes on."""
     with shmmap.connect(standing.endpoint) as client:
         session = client.welcome.session
-        for ids in (["x" * (5 << 20)], [f"{number:0100}.pcd" for number in range(45_000)]):
-            for ask in (client.selected, client.evict):
-                with pytest.raises(BadRequest, match="bytes; 4,194,304 are the most") as refused:
-                    ask(ids)
-                assert "some ids at a time" in refused.value.hint
+        for ask, ids in (
+            (client.selected, ["x" * (5 << 20)]),
+            (client.evict, ["x" * (5 << 20)]),
+            (client.evict, [f"{number:0100}.pcd" for number in range(45_000)]),
+        ):
+            with pytest.raises(BadRequest, match="bytes; 4,194,304 are the most") as refused:
+                ask(ids)  # type: ignore[operator]
+            assert "some ids at a time" in refused.value.hint
         held = [(f"{number:0100}.pcd", 1) for number in range(45_000)]
         with pytest.raises(BadRequest, match="4,194,304"):
             client.differential(shmmap.Circle(0.0, 0.0, 5.0), held)

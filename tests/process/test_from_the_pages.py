@@ -263,7 +263,7 @@ def test_layers_in_canonical_form(one: PlainClient) -> None:
     handles = [(handle[0], handle[2]) for handle in reply[4]]
     assert handles == [(name, layer) for name in FOUR for layer in ("points", canonical)]
     reply = one.ask("selected", ["0_0.pcd", FOUR[0], "0_0.pcd"], [canonical, "points", "points"], 30.0)
-    assert reply[9:] == [[canonical, "points", "points"], True, ""]
+    assert reply[9:] == [[canonical, "points", "points"], True, "", ""]
     assert [handle[0] for handle in reply[4]] == [
         name for name in ("0_0.pcd", FOUR[0], "0_0.pcd") for _ in "ab"
     ]
