@@ -182,32 +182,27 @@ def joined(parts: Sequence[CellSet]) -> CellSet:
     )
 
 
-def in_id_order(parts: Sequence[CellSet]) -> CellSet:
-    """Join the answers to the parts of a request by area; of a layer that came twice, the last counts."""
+def with_late(parts: Sequence[CellSet], again: CellSet, late: Container[tuple[str, str]]) -> CellSet:
+    """Join the answers to the parts of a request by area, and what became of the cells that were pending.
+
+    ``again`` is the answer for the ids of the ``late`` ones, which were pending in all parts but the last.
+    Cells that have left the map since then are left out.
+    """
     whole = joined(parts)
     order = {layer: place for place, layer in enumerate(whole.layers)}
-    last = {(cell.id, order.get(cell.layer, 0)): cell for cell in whole.cells}
-    whole.cells = tuple(last[key] for key in sorted(last))
-    return whole
-
-
-def without_pending(part: CellSet) -> CellSet:
-    """Return an answer of which everything pending was requested again."""
-    part.pending = ()
-    return part
-
-
-def only(part: CellSet, layers: Container[tuple[str, str]]) -> CellSet:
-    """Return some layers of an answer by id, less those of cells that have left the map."""
-    part.cells = tuple(cell for cell in part.cells if (cell.id, cell.layer) in layers)
-    part.pending = tuple(cell for cell in part.pending if (cell.id, cell.layer) in layers)
-    part.failed = tuple(
-        error
-        for error in part.failed
-        if (error.cell_id, error.layer) in layers and not isinstance(error, UnknownCell)
+    cells = {(cell.id, order[cell.layer]): cell for cell in whole.cells}
+    cells.update({(cell.id, order[cell.layer]): cell for cell in again if (cell.id, cell.layer) in late})
+    whole.cells = tuple(cells[key] for key in sorted(cells))
+    whole.pending = (
+        *(cell for cell in again.pending if (cell.id, cell.layer) in late),
+        *parts[-1].pending,
     )
-    part.covered = True
-    return part
+    whole.failed += tuple(
+        error
+        for error in again.failed
+        if (error.cell_id, error.layer) in late and not isinstance(error, UnknownCell)
+    )
+    return whole
 
 
 def gather(

@@ -28,10 +28,8 @@ from shmmap.client.cell_set import (
     HeldCells,
     PendingLayer,
     cell_error,
-    in_id_order,
     joined,
-    only,
-    without_pending,
+    with_late,
 )
 from shmmap.client.connection import TURNS, Connection, check_not_within_a_turn, closed
 from shmmap.client.request_table import Answers
@@ -262,13 +260,14 @@ class Session:
             found.append(some)
         if len(found) == 1:
             return found[0]
+        self.map_version = found[0].map_version
         late = {(cell.id, cell.layer) for some in found[:-1] for cell in some.pending}
         if late and left_s():
             ids, layers = tuple(sorted({cell_id for cell_id, _ in late})), found[-1].layers
             again = yield from self.selected(ids, layers, left_s(), populate=populate, timeout_s=timeout_s)
-            found = [without_pending(some) for some in found[:-1]] + [found[-1], only(again, late)]
-        self.map_version = found[0].map_version
-        return in_id_order(found)
+            self.map_version = found[0].map_version
+            return with_late(found, again, late)
+        return joined(found)
 
     def selected(
         self,

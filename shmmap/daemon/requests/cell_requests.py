@@ -25,7 +25,7 @@ from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.map.catalogue_view import PageNews
 from shmmap.daemon.records import SPACE_CODES, Key, Load, Resident
 from shmmap.daemon.requests import limits
-from shmmap.daemon.requests.differential import WarmDifference, difference, warm_difference
+from shmmap.daemon.requests.differential import WarmDifference, difference, is_among, warm_difference
 from shmmap.daemon.requests.waiting_list import CellRequest, Message, WaitingList
 from shmmap.daemon.transport.connection import Connection
 from shmmap.daemon.transport.sessions import Session
@@ -72,8 +72,8 @@ class _Found:
         Cells that the client should drop, as the reply encodes them.
     unknown
         Ids that the map does not contain, with the requested layers.
-    held_old
-        Layers of cells that the client holds in an outdated version.
+    held, held_old
+        Versions that the client holds, ascending; layers of cells that it holds in an outdated version.
     """
 
     cells: list[tuple[int, str]] = field(default_factory=list)
@@ -84,6 +84,7 @@ class _Found:
     removed: tuple[str, ...] = ()
     removed_packed: bytes = b""
     unknown: list[tuple[str, str]] = field(default_factory=list)
+    held: NDArray[np.uint64] = field(default_factory=lambda: np.zeros(0, np.uint64))
     held_old: Collection[Key] = ()
 
 
@@ -211,7 +212,7 @@ class CellRequests:
             lacks = difference(
                 self._cache, message, cells, layers, start=start, most=MAX_CELLS, covered=found.covered
             )
-            found.cells, found.held_old = lacks.cells, lacks.held_old
+            found.cells, found.held, found.held_old = lacks.cells, lacks.held, lacks.held_old
             found.removed, found.removed_packed = lacks.removed, lacks.removed_packed
             end = start + lacks.looked_at
         else:
@@ -394,7 +395,8 @@ class CellRequests:
         if resident is not None and cache.is_current(resident):
             answer.add(resident)
             return
-        if resident is not None and key not in found.held_old:
+        is_held = key in found.held_old or (resident and is_among(resident.version, found.held))
+        if resident is not None and not is_held:
             answer.add(resident, stale=True)
         if self._want(request, cell, key, distance, now_s):
             answer.outstanding.add(key)

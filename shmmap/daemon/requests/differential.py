@@ -8,7 +8,7 @@ is kept short.  `difference` covers all cases, with arrays: a client may hold ma
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final, cast
 
@@ -104,12 +104,15 @@ class Difference:
         Number of cells that were compared: the area's first ones from where the request begins.
     removed, removed_packed
         What the client should drop, as the reply encodes it.
+    held
+        Versions that the client holds, ascending.
     held_old
-        Layers of cells that the client holds in an outdated version.
+        Layers of cells that the client holds in an outdated version, as far as they are known.
     """
 
     cells: list[tuple[int, str]]
     looked_at: int
+    held: NDArray[np.uint64]
     removed: tuple[str, ...] = ()
     removed_packed: bytes = b""
     held_old: set[Key] = field(default_factory=set)
@@ -127,6 +130,8 @@ def difference(
 ) -> Difference:
     """Find which cells of an area the client lacks, whether they are in memory or not.
 
+    What it should drop is found with the last cell of the area.
+
     Parameters
     ----------
     area
@@ -143,20 +148,19 @@ def difference(
     check_packed(message.packed)
     held = np.unique(np.frombuffer(message.packed, "<u8"))
     has = _among(current[:looked_at], held)
-    found = Difference([], looked_at)
-    inside: Collection[int] = area.tolist()
+    found = Difference([], looked_at, held)
     if message.held:
-        inside = {index: place - start for place, index in enumerate(inside)}
-        _mark_named(cache, message.held, inside, layers, covered, has, found)
-    else:
-        inside = set(inside)
+        places = {index: place - start for place, index in enumerate(area.tolist())}
+        _mark_named(cache, message.held, places, layers, covered, has, found)
     lacked = np.flatnonzero(~has)
     if len(lacked) > most:
         found.looked_at = int(lacked[most - 1]) // len(layers) + 1
         lacked = lacked[lacked < found.looked_at * len(layers)]
-    places = [divmod(place, len(layers)) for place in lacked.tolist()]
-    found.cells = [(int(area[start + row]), layers[column]) for row, column in places]
-    _mark_gone(cache, held, area, layers, inside, covered, found)
+    cells = area[start : start + found.looked_at].tolist()
+    of_cells = (divmod(place, len(layers)) for place in lacked.tolist())
+    found.cells = [(cells[row], layers[column]) for row, column in of_cells]
+    if len(held) and start + found.looked_at == len(area):
+        _mark_gone(cache, area, layers, covered, found)
     return found
 
 
@@ -194,18 +198,15 @@ def _mark_named(
 
 def _mark_gone(
     cache: CellCache,
-    held: NDArray[np.uint64],
     area: NDArray[np.intp],
     layers: Sequence[str],
-    inside: Collection[int],
     covered: bool,
     found: Difference,
 ) -> None:
     """Note the versions that are not current in the area: outdated ones of its cells, and those to drop."""
-    if not len(held):
-        return
     current, _, complete = cache.layers.of_cells(area, layers)
-    of_version, gone = cache.warm.of_version, []
+    of_version, inside, held = cache.warm.of_version, set(area.tolist()), found.held
+    gone: list[int] = []
     for version in held[~_among(held, np.sort(current, axis=None))].tolist():
         key = of_version.get(version)
         cell = cache.index_of(key.cell_id) if key is not None else None
@@ -214,6 +215,11 @@ def _mark_gone(
         elif cell is not None or (covered and complete):  # else it may be current somewhere in the area
             gone.append(version)
     found.removed_packed = pack_versions(gone)
+
+
+def is_among(version: int, ordered: NDArray[np.uint64]) -> bool:
+    """Whether a version is among others, which are in ascending order."""
+    return bool(_among(np.array([version], np.uint64), ordered)[0])
 
 
 def _among(values: NDArray[np.uint64], ordered: NDArray[np.uint64]) -> NDArray[np.bool_]:
