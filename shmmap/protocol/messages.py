@@ -83,7 +83,7 @@ PROTOCOL_VERSION: Final = (3, 0)
 
 MAX_NAMES: Final = 20_000
 """Most cells that an operator's request may name one by one."""
-MAX_NAMED: Final = 4096
+MAX_NAMED: Final = 2048
 """Most held cells that a request may name one by one."""
 MAX_SELECTED: Final = 128
 """Most layers of cells that one `Selected` may ask for: its ids times its layers."""

@@ -575,7 +575,7 @@ def test_a_request_that_no_daemon_takes_is_refused_before_it_is_sent(standing: D
             (client.evict, [f"{number:0100}.pcd" for number in range(45_000)]),
         ):
             with pytest.raises(BadRequest, match="bytes; 4,194,304 are the most") as refused:
-                ask(ids)  # type: ignore[operator]
+                ask(ids)
             assert "some ids at a time" in refused.value.hint
         held = [(f"{number:0100}.pcd", 1) for number in range(45_000)]
         with pytest.raises(BadRequest, match="4,194,304"):

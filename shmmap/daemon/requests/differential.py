@@ -151,7 +151,7 @@ def difference(
     found = Difference([], looked_at, held)
     if message.held:
         places = {index: place - start for place, index in enumerate(area.tolist())}
-        _mark_named(cache, message.held, places, layers, covered, has, found)
+        _mark_named(cache, message.held, places, layers, covered, current[:looked_at], has, found)
     lacked = np.flatnonzero(~has)
     if len(lacked) > most:
         found.looked_at = int(lacked[most - 1]) // len(layers) + 1
@@ -170,29 +170,33 @@ def _mark_named(
     places: dict[int, int],
     layers: Sequence[str],
     covered: bool,
+    current: NDArray[np.uint64],
     has: NDArray[np.bool_],
     found: Difference,
 ) -> None:
     """Mark the layers that the client names as held; note its outdated layers, and what it should drop."""
-    version_of = cache.layers.version
-    columns = {layer: column for column, layer in enumerate(layers)}
+    columns, versions = {layer: column for column, layer in enumerate(layers)}, current.tolist()
     removed: dict[str, None] = {}
+    marked: list[tuple[int, int]] = []
     for cell in held:
         index = cache.index_of(cell.id)
         place = places.get(index) if index is not None else None
-        if index is None or place is None:
+        if place is None:
             if covered or index is not None:
                 removed[cell.id] = None
             continue
+        if not 0 <= place < len(versions):
+            continue
         named = layers if cell.layers is None else canonical_layers(cell.layers)
-        mine = [layer for layer in named if layer in columns]
+        mine = [columns[layer] for layer in named if layer in columns]
         if cell.version is not None:  # the current version of one of these layers, or an outdated one
-            current_of = [layer for layer in mine if cell.version == version_of(index, layer)]
-            if not current_of:
-                found.held_old.update(cache.key(index, layer) for layer in mine)
+            current_of = [column for column in mine if cell.version == versions[place][column]]
+            if not current_of and index is not None:
+                found.held_old.update(cache.key(index, layers[column]) for column in mine)
             mine = current_of
-        if 0 <= place < len(has):
-            has[place, [columns[layer] for layer in mine]] = True
+        marked += [(place, column) for column in mine]
+    if marked:
+        has[tuple(np.array(marked).T)] = True
     found.removed = tuple(removed)
 
 
@@ -205,15 +209,16 @@ def _mark_gone(
 ) -> None:
     """Note the versions that are not current in the area: outdated ones of its cells, and those to drop."""
     current, _, complete = cache.layers.of_cells(area, layers)
-    of_version, inside, held = cache.warm.of_version, set(area.tolist()), found.held
+    catalogue, of_version = cache.catalogue, cache.warm.of_version
+    others = found.held[~_among(found.held, np.sort(current, axis=None))].tolist()
+    inside = set(map(catalogue.id, area.tolist())) if others else ()
     gone: list[int] = []
-    for version in held[~_among(held, np.sort(current, axis=None))].tolist():
+    for version in others:
         key = of_version.get(version)
-        cell = cache.index_of(key.cell_id) if key is not None else None
-        if key is not None and cell in inside:
+        if key is not None and key.cell_id in inside:
             found.held_old.add(key)
-        elif cell is not None or (covered and complete):  # else it may be current somewhere in the area
-            gone.append(version)
+        elif (covered and complete) or (key is not None and catalogue.find(key.cell_id) is not None):
+            gone.append(version)  # else it may be current somewhere in the area
     found.removed_packed = pack_versions(gone)
 
 

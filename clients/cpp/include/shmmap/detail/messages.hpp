@@ -76,7 +76,7 @@ inline void write(Writer& to, const Held& held) {
 
 inline constexpr std::uint64_t protocol_major = 3, protocol_minor = 0;
 inline constexpr std::size_t max_selected = 128;  // layers of cells in a request by id
-inline constexpr std::size_t max_named = 4096;    // cells that one request names as held
+inline constexpr std::size_t max_named = 2048;    // cells that one request names as held
 
 /// The daemon's properties in its welcome.
 struct Welcome {
