@@ -34,6 +34,7 @@ from shmmap.errors import (
     StaleSocket,
     UnknownCell,
 )
+from shmmap.protocol import messages
 from shmmap.protocol.endpoint import SYSTEM_RUNTIME_DIR
 from shmmap.segment.attach import attach
 from tests.support.cpp_client import CppClient
@@ -44,6 +45,7 @@ from tests.support.segment_reader import names
 
 Factory = Callable[..., DaemonProcess]
 Connect = Callable[..., Any]
+LONG_S = 60.0
 Late = Callable[[str, Callable[[], object], float], AbstractContextManager[Any]]
 
 BOTH = pytest.mark.parametrize("language", ["python", pytest.param("c++", marks=pytest.mark.slow)])
@@ -131,6 +133,40 @@ def test_more_cells_than_one_reply_has(daemon: Factory, connect: Connect, tmp_pa
             (made.id(Path(cell).name), layer) for cell in ids if cell != "no such cell" for layer in layers
         ]
         assert [error.code for error in some.failed] == ["unknown_cell"] * 2
+
+
+def test_the_map_changes_between_two_replies(daemon: Factory, tmp_path: Path) -> None:
+    """A cell that was pending is gone when it is asked for again, one behind is removed, one is new."""
+    made = make_map(tmp_path / "many", columns=13, rows=13, points=5)
+    every = sorted(made.corners)
+    with shmmap.connect(daemon(made.root).endpoint) as client:
+        session, before = client.session, client.map_version
+        area = messages.BoxMessage(-1e4, -1e4, 1e4, 1e4)
+        steps = session.cells(
+            lambda n, start, left_s: messages.Area(n, area, ("points",), left_s, None, start), LONG_S
+        )
+        asked = next(steps)
+        first = session.ask(asked.make, asked.kind)
+        assert len(first.pending) == 128
+        made.remove_cell(every[3])
+        made.remove_cell(every[-2])
+        made.write_cell("zz.pcd", (900, 900), random_points(np.random.default_rng(1), (900, 900), 9))
+        made.write_metadata()
+        after = client.reload().map_version
+        asked = steps.send(first)
+
+        def rest() -> Any:
+            now = asked
+            while True:
+                try:
+                    now = steps.send((yield now))
+                except StopIteration as end:
+                    return end.value
+
+        found = session.run(rest())
+        assert names(found) == sorted(made.corners)
+        assert (found.complete, found.map_version) == (True, before)
+        assert before != after == client.differential(shmmap.Circle(0, 0, 1), ()).map_version
 
 
 def test_everything_says_what_it_is(standing: DaemonProcess, standing_map: DividedMap) -> None:
