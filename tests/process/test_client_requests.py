@@ -160,7 +160,7 @@ def test_the_map_changes_between_two_replies(daemon: Factory, tmp_path: Path) ->
             while True:
                 try:
                     now = steps.send((yield now))
-                except StopIteration as end:
+                except StopIteration as end:  # noqa: PERF203  the steps end with their answer
                     return end.value
 
         found = session.run(rest())
