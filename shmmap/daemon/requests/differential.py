@@ -144,9 +144,10 @@ def difference(
         Whether ``area`` has all cells of the area.  If not, a held cell that is not known may lie in it, and
         stays.
     """
-    current, looked_at, _ = cache.layers.of_cells(area[start:], layers)
     check_packed(message.packed)
     held = np.unique(np.frombuffer(message.packed, "<u8"))
+    enough = most + len(held) + len(message.held)  # cells of which ``most`` are lacked
+    current, looked_at, _ = cache.layers.of_cells(area[start : start + enough], layers)
     has = _among(current[:looked_at], held)
     found = Difference([], looked_at, held)
     if message.held:
