@@ -3,13 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, overload
 
 import numpy as np
 
 from shmmap.client.cell import Cell
-from shmmap.errors import BadRequest, CellError, ShmmapError
+from shmmap.errors import BadRequest, CellError, ShmmapError, UnknownCell
 from shmmap.protocol.messages import FailedCell, HeldCell
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ class CellSet(Sequence[Cell]):
     epoch : int
         Identifier of the daemon run that answered.
     map_version : int
-        State of the map that the reply describes.
+        State of the map that the reply describes; of several replies to one request the first one's.
     layers : tuple of str
         The requested layers, in order, under the names that `Cell.layer` uses.
     covered : bool
@@ -53,8 +53,7 @@ class CellSet(Sequence[Cell]):
         may still turn out to exist: ask again.
     reason : str
         Why missing cells are not being loaded: ``"offline"`` if the list of cells cannot be reached at
-        present.  Empty if the list is being fetched, if everything is covered, or if the daemon is older than
-        protocol 1.6.
+        present.  Empty if the list is being fetched, or if everything is covered.
     """
 
     __slots__ = (
@@ -163,6 +162,47 @@ class CellSet(Sequence[Cell]):
 
     def __getitem__(self, index: int | slice) -> Cell | tuple[Cell, ...]:
         return self.cells[index]
+
+
+def joined(parts: Sequence[CellSet]) -> CellSet:
+    """Join the answers to the parts of one request; removals are those of the last part that has any.
+
+    The map may change between two of them: the state named is the first, after which all that changed is new.
+    """
+    return CellSet(
+        tuple(cell for part in parts for cell in part.cells),
+        tuple(error for part in parts for error in part.failed),
+        tuple(cell for part in parts for cell in part.pending),
+        next((part.removed for part in reversed(parts) if part.removed), ()),
+        parts[-1].epoch,
+        parts[0].map_version,
+        parts[-1].layers,
+        all(part.covered for part in parts),
+        next((part.reason for part in parts if part.reason), ""),
+    )
+
+
+def with_late(parts: Sequence[CellSet], again: CellSet, late: Container[tuple[str, str]]) -> CellSet:
+    """Join the answers to the parts of a request by area, and what became of the cells that were pending.
+
+    ``again`` is the answer for the ids of the ``late`` ones, which were pending in all parts but the last.
+    Cells that have left the map since then are left out.
+    """
+    whole = joined(parts)
+    order = {layer: place for place, layer in enumerate(whole.layers)}
+    cells = {(cell.id, order[cell.layer]): cell for cell in whole.cells}
+    cells.update({(cell.id, order[cell.layer]): cell for cell in again if (cell.id, cell.layer) in late})
+    whole.cells = tuple(cells[key] for key in sorted(cells))
+    whole.pending = (
+        *(cell for cell in again.pending if (cell.id, cell.layer) in late),
+        *parts[-1].pending,
+    )
+    whole.failed += tuple(
+        error
+        for error in again.failed
+        if (error.cell_id, error.layer) in late and not isinstance(error, UnknownCell)
+    )
+    return whole
 
 
 def gather(

@@ -258,7 +258,7 @@ class Client(SessionState):
         return self._run(
             self._answer(
                 lambda wait_s: self._session.cells(
-                    lambda n: messages.Area(n, message, specs, wait_s, sent), wait_s
+                    lambda n, start, left_s: messages.Area(n, message, specs, left_s, sent, start), wait_s
                 ),
                 area,
                 wait,
@@ -303,7 +303,7 @@ class Client(SessionState):
         def steps() -> Steps[PointsAround]:
             found = yield from self._answer(
                 lambda wait_s: self._session.cells(
-                    lambda n: messages.Area(n, message, specs, wait_s), wait_s
+                    lambda n, start, left_s: messages.Area(n, message, specs, left_s, None, start), wait_s
                 ),
                 circle,
                 wait,
@@ -385,9 +385,7 @@ class Client(SessionState):
         wanted, sent = names("ids", ids), given_intent(pose, velocity, heading, route)
         return self._run(
             self._answer(
-                lambda wait_s: self._session.cells(
-                    lambda n: messages.Selected(n, wanted, specs, wait_s, sent), wait_s
-                ),
+                lambda wait_s: self._session.selected(wanted, specs, wait_s, sent),
                 None,
                 wait,
                 strict,

@@ -63,7 +63,6 @@ _OPTIONS: Final = (
 _POLLIN: Final = int(zmq.POLLIN)  # operators of zmq's enumerations take microseconds
 _SILENT_HINT: Final = "the daemon is stopped, hung, overloaded or gone: see `shmmap health`"
 _UPDATE_HINT: Final = "update the older of client and daemon"
-_CANCEL_MINOR: Final = 1  # minor version of the protocol since which there is `Cancel`
 _MAX_NAME: Final = 64  # characters of a program's name that the daemon keeps
 SERVED_PAUSE_S: Final = 0.05
 """Pause between two tries to reach a live map: no event reports that its process is running again."""
@@ -248,7 +247,6 @@ class _Exchange:
             )
         self._take_events()
         self.slot, self.welcome, self.handshakes = reply.session, reply, self.watch.handshakes
-        self.table.can_cancel = reply.minor >= _CANCEL_MINOR
         self.table.session_begun(reply)
 
     def _take_events(self) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 
 import shmmap.geometry as geometry
 from shmmap.client.session import Session
-from shmmap.errors import NoAnswer, ProtocolMismatch
+from shmmap.errors import NoAnswer
 from shmmap.protocol import messages
 from shmmap.protocol.messages import MetadataRow
 
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 _ROUNDS: Final = 5  # how often a listing is restarted because the map changed meanwhile
 _PAGE_ROWS: Final = 10_000
-_LIST_CELLS_MINOR: Final = 2  # minor version of the protocol since which there is `ListCells`
 
 
 class CellInfo(NamedTuple):
@@ -160,14 +159,7 @@ def list_segments(session: Session) -> list[CellRow]:
     ------
     NoAnswer
         No reply before the deadline, or the daemon was restarted each time before the last page.
-    ProtocolMismatch
-        The daemon is of a version that had this list in its statistics.
     """
-    if (welcome := session.welcome).minor < _LIST_CELLS_MINOR:
-        raise ProtocolMismatch(
-            f"the daemon speaks protocol {welcome.major}.{welcome.minor}: it cannot list what is in memory",
-            hint="update the daemon, and restart it",
-        )
     for _ in range(_ROUNDS):
         found: dict[str, CellRow] = {}  # by name: while segments go, one may be on two pages
         epoch, start = 0, 0

@@ -117,8 +117,6 @@ class RequestTable:
         The request for a session that has to be answered before anything else is sent.
     cancels : deque
         Ids of requests whose waits the daemon should end.
-    can_cancel : bool
-        Whether the daemon knows `Cancel`.
     next_s : float
         When `tick` has something to do, at the earliest.
     """
@@ -127,7 +125,6 @@ class RequestTable:
         self.entries: dict[int, Outstanding] = {}
         self.hello: Outstanding | None = None
         self.cancels: deque[int] = deque()
-        self.can_cancel = False
         self.next_s = math.inf
         self._unsent: OrderedDict[int, Outstanding] = OrderedDict()
         self._held: OrderedDict[int, Outstanding] = OrderedDict()
@@ -157,7 +154,7 @@ class RequestTable:
         for request, waits in requests:
             if request in self._waiting or (waits and request not in self.entries):
                 places += 1
-                if self.can_cancel and self.hello is None:
+                if self.hello is None:
                     self.cancels.append(request)
             elif request in self._unsent:  # it may have been held, and about to use a place
                 places += 1
@@ -240,6 +237,7 @@ class RequestTable:
             and (len(self._waiting) > 1 or entry.freed != self._freed)
             and now_s < entry.wait_until_s - TICK_S
             and isinstance(reply, Cells)
+            and not reply.next
             and bool(reply.pending or not (reply.covered or reply.reason))
         )
 
@@ -280,7 +278,7 @@ class RequestTable:
             next_s = hello.due_s
         for entry in list(self.entries.values()):
             if now_s >= entry.deadline_s:
-                if entry.request in self._waiting and self.can_cancel:
+                if entry.request in self._waiting:
                     self.cancels.append(entry.request)
                 self._finish(entry, silence(entry))
                 self._use_free_place(now_s)

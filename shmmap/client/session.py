@@ -2,7 +2,8 @@
 """State that all requests of one client share: connection, attached cells, lock, and handling of forks.
 
 A request for cells is complete when its handles are attached; handles that became stale meanwhile are
-requested again.
+requested again.  A reply has a bounded number of cells: where there are more, the client goes on behind the
+last one, and at the end it asks again for what was being loaded.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import time
 import weakref
 from collections.abc import Callable, Generator, Iterable, Sequence
 from functools import partial
+from itertools import islice
 from queue import SimpleQueue
 from typing import Any, Final, NoReturn, TypeAlias, TypeVar
 
@@ -21,7 +23,14 @@ import numpy as np
 
 from shmmap.client.attaching import Attacher, check_visible, owner_of_segments
 from shmmap.client.cell import Access, Cell
-from shmmap.client.cell_set import CellSet, HeldCells, PendingLayer, cell_error
+from shmmap.client.cell_set import (
+    CellSet,
+    HeldCells,
+    PendingLayer,
+    cell_error,
+    joined,
+    with_late,
+)
 from shmmap.client.connection import TURNS, Connection, check_not_within_a_turn, closed
 from shmmap.client.request_table import Answers
 from shmmap.errors import CellError, LoadFailed, SegmentCorrupt, StaleHandle
@@ -32,7 +41,7 @@ from shmmap.protocol.messages import Handle
 
 R = TypeVar("R")
 
-_STALE_ROUNDS: Final = 5  # how often a handle that became stale before it was attached is requested again
+_STALE_ROUNDS: Final = 8  # how often a handle that became stale before it was attached is requested again
 _MAX_STALE_WAIT_S: Final = 5.0  # longest wait that such a request allows the daemon
 
 
@@ -45,6 +54,8 @@ class Asked(msgspec.Struct):
     quiet_s: float
 
 
+Ask: TypeAlias = Callable[[int, str, float | None], messages.Request]
+"""Makes a request for the cells of an area from a request id, ``start`` and ``wait``."""
 Steps: TypeAlias = Generator[Asked, Any, R]
 """Requests that are sent one after another, each after the reply to the one before; returns an answer."""
 
@@ -211,19 +222,22 @@ class Session:
 
     def cells(
         self,
-        make: Callable[[int], messages.Request],
+        ask: Ask,
         wait_s: float | None,
         *,
         removed: Callable[[Sequence[str], bytes], tuple[str, ...]] | None = None,
         populate: bool = False,
         timeout_s: float | None = None,
     ) -> Steps[CellSet]:
-        """Ask for cells and attach the cells of the reply.
+        """Ask for the cells of an area and attach them, reply after reply.
+
+        Only the last reply waits for loads, so that all have begun by then; what was pending in the others is
+        asked for again by id.
 
         Parameters
         ----------
         wait_s
-            Seconds that the request lets the daemon wait.
+            Seconds that the requests together let the daemon wait.
         removed
             Returns the removed ids from the reply's two lists of removals.
         populate
@@ -231,6 +245,73 @@ class Session:
         timeout_s
             Replaces the session's own timeout.
         """
+        left_s = _Countdown(wait_s)
+        found: list[CellSet] = []
+        start = ""
+        while start or not found:
+            now_s = left_s()
+            some, start = yield from self._page(
+                lambda n, start=start, now_s=now_s: ask(n, start, now_s),  # type: ignore[misc]
+                now_s,
+                removed=removed,
+                populate=populate,
+                timeout_s=timeout_s,
+            )
+            found.append(some)
+        if len(found) == 1:
+            return found[0]
+        self.map_version = found[0].map_version
+        late = {(cell.id, cell.layer) for some in found[:-1] for cell in some.pending}
+        if late and left_s():
+            ids, layers = tuple(sorted({cell_id for cell_id, _ in late})), found[-1].layers
+            again = yield from self.selected(ids, layers, left_s(), populate=populate, timeout_s=timeout_s)
+            self.map_version = found[0].map_version
+            return with_late(found, again, late)
+        return joined(found)
+
+    def selected(
+        self,
+        ids: tuple[str, ...],
+        layers: tuple[str, ...],
+        wait_s: float | None,
+        intent: messages.Intent | None = None,
+        *,
+        spare: bool = False,
+        populate: bool = False,
+        timeout_s: float | None = None,
+    ) -> Steps[CellSet]:
+        """Ask for cells by id and attach them, some in each request; parameters are those of `cells`."""
+        left_s = _Countdown(wait_s)
+        most = max(1, messages.MAX_SELECTED // max(1, len(layers)))
+        parts = [ids[at : at + most] for at in range(0, len(ids), most)] or [()]
+
+        def ask(part: tuple[str, ...], part_wait_s: float | None) -> Steps[CellSet]:
+            some, _ = yield from self._page(
+                lambda n: messages.Selected(n, part, layers, part_wait_s, intent, spare),
+                part_wait_s,
+                populate=populate,
+                timeout_s=timeout_s,
+            )
+            return some
+
+        found: dict[tuple[str, ...], CellSet] = {}
+        for part in parts:  # the last one waits, when all loads have begun
+            found[part] = yield from ask(part, None if part is not parts[-1] else left_s())
+        for part in parts[:-1]:
+            if found[part].pending and left_s():
+                found[part] = yield from ask(part, left_s())
+        return joined([found[part] for part in parts]) if len(parts) > 1 else found[parts[0]]
+
+    def _page(
+        self,
+        make: Callable[[int], messages.Request],
+        wait_s: float | None,
+        *,
+        removed: Callable[[Sequence[str], bytes], tuple[str, ...]] | None = None,
+        populate: bool = False,
+        timeout_s: float | None = None,
+    ) -> Steps[tuple[CellSet, str]]:
+        """Ask once and attach the cells of the reply; return them, and where to go on."""
         quiet_s = wait_s or 0.0
         all_s = (self.timeout_s if timeout_s is None else timeout_s) + quiet_s
         deadline_s = time.monotonic() + all_s
@@ -248,7 +329,7 @@ class Session:
             if answer.gone:  # not at first: a daemon that ends removes all its segments
                 welcome = answer.welcome
                 check_visible(self._shm_dir or welcome.shm_dir, welcome.segment_prefix)
-        return answer.result(reply, removed)
+        return answer.result(reply, removed), reply.next
 
     def _take(self, answer: _ReplyCells, reply: messages.Cells, places: Iterable[int]) -> None:
         if self._attaching.locked():
@@ -270,7 +351,9 @@ class Session:
         """Ask for the cells of an area that are not held; see `shmmap.Client.differential`."""
         message = messages.area_to_message(area)
         return self.cells(
-            lambda n: messages.Differential(n, message, layers, held.named, held.packed, wait_s, intent),
+            lambda n, start, left_s: messages.Differential(
+                n, message, layers, held.named, held.packed, left_s, intent, start
+            ),
             wait_s,
             removed=held.removed,
             populate=populate,
@@ -361,6 +444,7 @@ class _ReplyCells:
         self._failed: list[CellError] = []
         self._pending: list[PendingLayer] = []
         self.gone: list[tuple[int, Handle]] = []
+        self._again: tuple[str, ...] = ()
 
     def take(self, reply: messages.Cells, places: Iterable[int]) -> None:
         """Attach a reply's handles at these places; record which became stale meanwhile and which failed."""
@@ -389,8 +473,9 @@ class _ReplyCells:
     def ask_again(self, deadline_s: float) -> Asked:
         """Return the request for the handles whose segments were gone before they could be attached."""
         timeout_s = max(deadline_s - time.monotonic(), 1e-3)
-        ids = tuple(dict.fromkeys(handle.id for _, handle in self.gone))
         layers = tuple(dict.fromkeys(handle.layer for _, handle in self.gone))
+        most = max(1, messages.MAX_SELECTED // len(layers))
+        self._again = ids = tuple(islice(dict.fromkeys(handle.id for _, handle in self.gone), most))
         wait_s = min(timeout_s / 2, _MAX_STALE_WAIT_S)
         return Asked(
             lambda n: messages.Selected(n, ids, layers, wait_s), messages.Cells, timeout_s, timeout_s / 2
@@ -398,7 +483,8 @@ class _ReplyCells:
 
     def placed(self, reply: messages.Cells) -> tuple[messages.Cells, list[int]]:
         """Return what is new of the reply to `ask_again`, and the places of its cells."""
-        gone, self.gone = self.gone, []
+        gone = [one for one in self.gone if one[1].id in self._again]
+        self.gone = [one for one in self.gone if one[1].id not in self._again]
         places: dict[tuple[str, str], list[int]] = {}
         for place, handle in gone:
             places.setdefault((handle.id, handle.layer), []).append(place)
@@ -432,6 +518,16 @@ class _ReplyCells:
             reply.covered,
             reply.reason,
         )
+
+
+class _Countdown:
+    """What is left of the seconds that requests may wait; None stays None."""
+
+    def __init__(self, wait_s: float | None) -> None:
+        self._end_s = None if wait_s is None else time.monotonic() + wait_s
+
+    def __call__(self) -> float | None:
+        return None if self._end_s is None else max(0.0, self._end_s - time.monotonic())
 
 
 def _whole_id(cell_id: str, welcome: messages.Welcome) -> str:

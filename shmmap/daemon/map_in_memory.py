@@ -37,7 +37,7 @@ from shmmap.daemon.loading.worker_pool import WorkerPool
 from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.pins.probe import PinSource
 from shmmap.daemon.pins.watch import PinWatch
-from shmmap.daemon.requests.pending_request import WaitingList
+from shmmap.daemon.requests.waiting_list import WaitingList
 from shmmap.daemon.transport.sessions import Sessions
 from shmmap.daemon.turns import WatchedDescriptors
 from shmmap.errors import CannotStart, ConfigError

@@ -125,7 +125,7 @@ class ServingLoop:
             return 0
         until_s = min(
             self.scheduler.next_event_s(),
-            self.cells.next_deadline_s(),
+            self.cells.next_s(),
             self.operators.stop_by_s,
             *(task.next_s for _kind, task in self.tasks),
         )
@@ -166,7 +166,7 @@ class ServingLoop:
             yield
             self._ready.pop(fd, None)
             self._call(fd)
-            self._guarded("answers", self.cells.answer_finished)
+            self._guarded("answers", self.cells.answer_due, time.monotonic())
         yield
         self._do_what_is_due(time.monotonic())
         yield
@@ -184,7 +184,7 @@ class ServingLoop:
     def _do_what_is_due(self, now_s: float) -> None:
         """Handle deadlines, and run the next step of a background task."""
         self._guarded("loaders", self.scheduler.lost.end_overdue, now_s)
-        self._guarded("answers", self.cells.answer_overdue, now_s)
+        self._guarded("answers", self.cells.answer_due, now_s)
         for _ in range(len(self.tasks)):
             kind, task = self.tasks[0]
             self.tasks.rotate(-1)

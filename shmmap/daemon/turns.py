@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import select
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from typing import Final, Generic, TypeVar
 
 DESCRIPTORS_PER_TURN: Final = 16
@@ -59,41 +59,24 @@ class WatchedDescriptors:
 
 
 TURN_S: Final = 0.0005
-"""Time after which work is left to the next turn.  A request for some hundred cells needs less."""
-
-BATCH: Final = 16
-"""Items between two checks of the time, if each takes some microseconds."""
+"""Time after which a walk over many things is left to the next turn."""
 
 Item = TypeVar("Item")
 
 
-def batched(items: Sequence[Item]) -> Iterator[Sequence[Item]]:
-    """Return batches of items; the time is checked before each batch."""
-    return (items[begin : begin + BATCH] for begin in range(0, len(items), BATCH))
-
-
 class Pace:
-    """Time limit of a generator in its current turn."""
+    """Time limit of an operator's or a statistics request in its current turn."""
 
     __slots__ = ("_end_s",)
 
     def __init__(self) -> None:
-        self.begin()
-
-    def begin(self) -> None:
-        """Begin a turn."""
         self._end_s = time.monotonic() + TURN_S
-
-    @property
-    def is_over(self) -> bool:
-        """Whether the turn's time is used up."""
-        return time.monotonic() >= self._end_s
 
     def pause(self) -> Iterator[None]:
         """End the turn if its time is used up, and begin the next one."""
-        if self.is_over:
+        if time.monotonic() >= self._end_s:
             yield
-            self.begin()
+            self._end_s = time.monotonic() + TURN_S
 
 
 class Walk(Generic[Item]):

@@ -2,13 +2,13 @@
 """Versions of the layers of a map's cells, and the neighbouring cells that a layer uses.
 
 The version of a layer with a halo includes its neighbours' versions.  Finding the neighbours takes about
-40 us, so these versions are cached until one of the cells changes, and a caller that needs many of them first
-checks which are `unknown`.
+40 us, and hashing some us.  So versions are kept in tables by cell, until one of the cells that they depend
+on changes, and `LayerVersions.of_cells` takes those of many cells from a table at once.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import lru_cache
 from typing import Final, NamedTuple, Protocol
 
@@ -17,16 +17,20 @@ from numpy.typing import NDArray
 
 from shmmap.errors import BadRequest
 from shmmap.geometry import Area, Box
-from shmmap.large_tables import ShardedDict
+from shmmap.large_tables import sparse_zeros
 from shmmap.layers.points import LAYER
 from shmmap.layers.spec import layer_spec
 from shmmap.segment.version import layer_version
 
 MAX_NEIGHBOURS: Final = 64
 """Maximum number of neighbouring files that a layer with a halo reads."""
-MAX_REMEMBERED: Final = 1 << 18
-"""Maximum number of cached versions, about 100 bytes each; it limits the memory that requests can fill."""
-
+TABLES_BYTES: Final = 64 << 20
+"""Memory of all tables; each takes 8 bytes per cell of the map, but untouched pages of it take none."""
+LEAST_TABLES: Final = 4
+COMPUTED_AT_ONCE: Final = 512
+"""Versions that one call of `LayerVersions.of_cells` computes."""
+HALO_COST: Final = 16
+"""Versions that are hashed in the time in which one neighbourhood is searched."""
 
 _SLACK_M: Final = 1e-3
 """Distance by which the search for cells exceeds the halo; `neighbours` then compares exactly."""
@@ -94,8 +98,7 @@ class LayerVersions:
 
     def __init__(self, catalogue: Callable[[], Cells]) -> None:
         self._catalogue = catalogue
-        self._known: dict[str, ShardedDict[int, int]] = {}  # by layer (only with a halo), then by cell
-        self._count = 0
+        self._tables: dict[str, NDArray[np.uint64]] = {}  # by layer, then by cell; 0: not computed yet
 
     def version(self, index: int, layer: str) -> int:
         """Return the current version of one layer of a cell, see `shmmap.segment.version`.
@@ -111,23 +114,54 @@ class LayerVersions:
         kind = _kind(layer)
         if not kind.halo_m:
             return layer_version(cell(index), layer, kind.builder_version)
-        known = self._known.get(layer)
-        version = known.get(index) if known is not None else None
-        if version is None:
+        table = self._table(layer)
+        version = int(table[index])
+        if not version:
             around, complete = self._around(index, kind.halo_m)
             if not complete:
                 return 0
             near = [cell(one) for one in around[: MAX_NEIGHBOURS + 1].tolist()]
             version = layer_version(cell(index), layer, kind.builder_version, near)
-            self._remember(index, layer, version)
+            table[index] = version
         return version
 
-    def unknown(self, indices: Iterable[int], layers: Iterable[str]) -> Iterator[tuple[int, str]]:
-        """Yield cells and layers whose `version` is not cached, so that neighbours have to be searched."""
-        for layer in layers:
-            if _kind(layer).halo_m:
-                known = self._known.get(layer)
-                yield from ((index, layer) for index in indices if known is None or index not in known)
+    def of_cells(
+        self, cells: NDArray[np.intp], layers: Sequence[str]
+    ) -> tuple[NDArray[np.uint64], int, bool]:
+        """Return the current versions of many cells' layers, as far as they can be found in milliseconds.
+
+        Returns
+        -------
+        versions
+            (N, L) uint64, 0 for a version that is not known yet.
+        count
+            Number of leading cells whose versions were looked for; at least one, if there is one.
+        complete
+            Whether all versions are known.
+        """
+        cost = sum(HALO_COST if _kind(layer).halo_m else 1 for layer in layers)
+        count, most = len(cells), max(1, COMPUTED_AT_ONCE // max(1, cost))
+        versions = np.empty((count, len(layers)), np.uint64)
+        for column, layer in enumerate(layers):
+            table = self._table(layer)
+            found = table[cells]
+            unknown = np.flatnonzero(found == 0)
+            for place in unknown[:most].tolist():
+                index = int(cells[place])
+                found[place] = table[index] = self.version(index, layer)
+            if len(unknown) > most:
+                count = min(count, int(unknown[most]))
+            versions[:, column] = found
+        return versions, count, bool(versions.all())
+
+    def _table(self, layer: str) -> NDArray[np.uint64]:
+        table = self._tables.get(layer)
+        if table is None:
+            cells = len(self._catalogue())
+            if len(self._tables) >= max(LEAST_TABLES, TABLES_BYTES // (8 * max(1, cells))):
+                del self._tables[next(iter(self._tables))]
+            table = self._tables[layer] = sparse_zeros(cells, np.uint64)
+        return table
 
     def neighbours(self, index: int, layer: str) -> list[int]:
         """Return the catalogue indices of the neighbouring cells that a cell's layer uses, in id order.
@@ -206,28 +240,12 @@ class LayerVersions:
                 near = around[looks & (boxes[:, 1] - halo_m <= max_y) & (boxes[:, 3] + halo_m >= min_y)]
             yield layer, [index, *near.tolist()]
 
-    def _remember(self, index: int, layer: str, version: int) -> None:
-        if self._count >= MAX_REMEMBERED:
-            oldest, known = next(iter(self._known.items()))
-            known.popitem()
-            self._count -= 1
-            if not known:
-                del self._known[oldest]
-        if layer not in self._known:
-            self._known[layer] = ShardedDict()
-        self._known[layer][index] = version
-        self._count += 1
-
     def cell_changed(self, index: int) -> None:
-        """Drop the cached versions of layers that use a cell, whose version has changed."""
-        for layer, cells in self.dependents(index, list(self._known)):
-            known = self._known[layer]
-            for cell in cells:
-                self._count -= known.pop(cell, None) is not None
-            if not known:
-                del self._known[layer]
+        """Drop the versions in the tables that depend on a cell, which has changed."""
+        for layer, cells in self.dependents(index, list(self._tables)):
+            self._tables[layer][cells] = 0
 
-    def forget(self) -> list[ShardedDict[int, int]]:
-        """Drop all versions, as indices now name other cells; return them, since freeing them takes time."""
-        known, self._known, self._count = list(self._known.values()), {}, 0
-        return known
+    def forget(self) -> list[NDArray[np.uint64]]:
+        """Drop all tables, as indices now name other cells; return them, since freeing them takes time."""
+        tables, self._tables = list(self._tables.values()), {}
+        return tables

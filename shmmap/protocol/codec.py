@@ -5,14 +5,14 @@ from __future__ import annotations
 
 import struct
 import threading
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
 from typing import Final
 
 import msgspec
 
 from shmmap.errors import BadRequest, ProtocolMismatch
-from shmmap.protocol.messages import Handle, Reply, Request
+from shmmap.protocol.messages import FailedCell, Handle, PendingCell, Reply, Request
 
 MAX_REQUEST_BYTES: Final = 4 << 20
 """Largest request; the socket itself refuses larger ones.  10^5 packed held cells need 800 kB."""
@@ -61,31 +61,6 @@ def encode_handle(handle: Handle) -> bytes:
     return _encoder.encode(handle)
 
 
-class PackedArray:
-    """An array of a message, encoded in parts, since many elements at once would take too long."""
-
-    def __init__(self, elements: Sequence[object] = ()) -> None:
-        self._count = 0
-        self._parts: list[bytes] = []
-        self.add(elements)
-
-    def add(self, elements: Sequence[object]) -> None:
-        """Encode and append elements."""
-        if elements:
-            self._count += len(elements)
-            self._parts.append(encode(elements)[len(_head(len(elements))) :])
-
-    def add_encoded(self, elements: Sequence[bytes]) -> None:
-        """Append elements that are encoded already."""
-        self._count += len(elements)
-        self._parts.append(b"".join(elements))
-
-    def parts(self) -> Iterator[bytes]:
-        """Yield the encoded array in parts."""
-        yield _head(self._count)
-        yield from self._parts
-
-
 def _head(count: int) -> bytes:
     """Encode the head of an array of ``count`` elements."""
     if count < 16:
@@ -95,30 +70,26 @@ def _head(count: int) -> bytes:
     return b"\xdd" + count.to_bytes(4, "big")
 
 
-_NOTHING: Final = PackedArray()
-
-
 def encode_cells(
     request: int,
     epoch: int,
     map_version: int,
-    handles: PackedArray,
+    handles: Sequence[bytes],
     removed: tuple[str, ...],
     removed_packed: bytes,
     layers: tuple[str, ...],
-    covered: bool = True,
-    pending: PackedArray = _NOTHING,
-    failed: PackedArray = _NOTHING,
     *,
+    covered: bool = True,
+    pending: Sequence[PendingCell] = (),
+    failed: Sequence[FailedCell] = (),
     reason: str = "",
+    next_id: str = "",
 ) -> bytes:
-    """Return a `Cells` reply assembled from encoded parts."""
+    """Return a `Cells` reply whose handles are encoded already."""
     start = encode(("cells", request, epoch, map_version))
-    dropped = encode((removed, removed_packed))
-    end = encode((layers, covered, reason))
-    # one array of twelve elements instead of three: replace their one-byte heads
-    parts = (start[1:], *handles.parts(), dropped[1:], *pending.parts(), *failed.parts(), end[1:])
-    return b"".join((b"\x9c", *parts))
+    end = encode((removed, removed_packed, pending, failed, layers, covered, reason, next_id))
+    # one array of thirteen elements instead of two: replace their one-byte heads
+    return b"".join((b"\x9d", start[1:], _head(len(handles)), *handles, end[1:]))
 
 
 def decode_request(data: bytes | memoryview) -> Request:

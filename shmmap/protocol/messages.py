@@ -79,15 +79,19 @@ __all__ = [
     "area_to_message",
 ]
 
-PROTOCOL_VERSION: Final = (2, 2)
+PROTOCOL_VERSION: Final = (3, 0)
 
 MAX_NAMES: Final = 20_000
-"""Most cells that a request may name one by one."""
+"""Most cells that an operator's request may name one by one."""
+MAX_NAMED: Final = 2048
+"""Most held cells that a request may name one by one."""
+MAX_SELECTED: Final = 128
+"""Most layers of cells that one `Selected` may ask for: its ids times its layers."""
 MAX_LAYERS: Final = 64
 
 Ids: TypeAlias = Annotated[tuple[str, ...], msgspec.Meta(max_length=MAX_NAMES)]
 Layers: TypeAlias = Annotated[tuple[str, ...], msgspec.Meta(max_length=MAX_LAYERS)]
-Held: TypeAlias = Annotated[tuple[HeldCell, ...], msgspec.Meta(max_length=MAX_NAMES)]
+Held: TypeAlias = Annotated[tuple[HeldCell, ...], msgspec.Meta(max_length=MAX_NAMED)]
 
 
 class Hello(Message, tag="hello"):
@@ -120,20 +124,21 @@ class Area(Message, tag="area"):
     """Request cells that touch an area.
 
     ``wait`` is how many seconds the reply may wait for loads; with nil the daemon answers at once with the
-    resident cells, and lists the others as pending.
+    resident cells, and lists the others as pending.  ``start`` is `Cells.next` of the previous reply.
     """
 
     area: AreaMessage
     layers: Layers = ("points",)
     wait: float | None = None
     intent: Intent | None = None
+    start: str = ""
 
 
 class Differential(Message, tag="differential"):
     """Request cells that touch an area, minus those that the client holds.
 
     ``held`` names cells one by one; ``packed`` is the same as versions alone, 8 bytes little-endian
-    each: a version names one layer of one cell.
+    each: a version names one layer of one cell.  ``start`` is `Cells.next` of the previous reply.
     """
 
     area: AreaMessage
@@ -142,12 +147,13 @@ class Differential(Message, tag="differential"):
     packed: bytes = b""
     wait: float | None = None
     intent: Intent | None = None
+    start: str = ""
 
 
 class Selected(Message, tag="selected"):
-    """Request cells by id; the reply keeps order and duplicates.
+    """Request cells by id, at most `MAX_SELECTED`; the reply keeps order and duplicates.
 
-    A ``spare`` request (since 2.1) must cost other clients nothing: one of its loads begins at a time, while
+    A ``spare`` request must cost other clients nothing: one of its loads begins at a time, while
     no other load waits and memory is free.  Its cells are evicted first, unless another request asks for
     them.  ``pending`` then promises no load.
     """
@@ -170,7 +176,7 @@ class Stats(Message, tag="stats"):
 
 
 class ListCells(Message, tag="list_cells"):
-    """Request a page of the segments in memory (since 2.2); ``start`` is the last page's ``next``."""
+    """Request a page of the segments in memory ; ``start`` is the last page's ``next``."""
 
     start: int = 0
 
@@ -209,7 +215,7 @@ class Shutdown(Message, tag="shutdown"):
 
 
 class Cancel(Message, tag="cancel"):
-    """End the wait of the session's request with this id; neither that nor this is answered.  Since 2.1."""
+    """End the wait of the session's request with this id; neither that nor this is answered."""
 
 
 class Bye(Message, tag="bye"):
@@ -319,7 +325,8 @@ class Cells(Message, tag="cells"):
     the same for packed versions, in any order.  ``layers`` are the requested layers, in order, in canonical
     form. ``covered`` is false if the list of cells is not yet known for part of the request; no cell of that
     part is removed.  ``reason`` is ``offline`` if that list is unreachable at present, and empty if it is
-    being fetched.
+    being fetched.  A reply is bounded: if there is more, ``next`` is the ``start`` to go on with, else it is
+    empty.  Only the last reply has removals.
     """
 
     epoch: int
@@ -332,6 +339,7 @@ class Cells(Message, tag="cells"):
     layers: tuple[str, ...] = ()
     covered: bool = True
     reason: str = ""
+    next: str = ""
 
 
 class MetadataRow(msgspec.Struct, array_like=True, frozen=True, gc=False):

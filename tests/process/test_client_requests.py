@@ -34,16 +34,18 @@ from shmmap.errors import (
     StaleSocket,
     UnknownCell,
 )
+from shmmap.protocol import messages
 from shmmap.protocol.endpoint import SYSTEM_RUNTIME_DIR
 from shmmap.segment.attach import attach
 from tests.support.cpp_client import CppClient
 from tests.support.daemon_process import DaemonProcess, Deadline, open_files
-from tests.support.divided_map import DividedMap, random_points
+from tests.support.divided_map import DividedMap, make_map, random_points
 from tests.support.process_costs import descriptors
 from tests.support.segment_reader import names
 
 Factory = Callable[..., DaemonProcess]
 Connect = Callable[..., Any]
+LONG_S = 60.0
 Late = Callable[[str, Callable[[], object], float], AbstractContextManager[Any]]
 
 BOTH = pytest.mark.parametrize("language", ["python", pytest.param("c++", marks=pytest.mark.slow)])
@@ -99,6 +101,72 @@ def test_the_first_program(
     monkeypatch.setenv("SHMMAP_ENDPOINT", standing.endpoint)
     cells = shmmap.connect().around(3.0, 4.0, radius=50)
     assert sum(len(cell.xyz) for cell in cells) == 500 * len(standing_map.in_circle(3.0, 4.0, 50))
+
+
+@BOTH
+def test_more_cells_than_one_reply_has(daemon: Factory, connect: Connect, tmp_path: Path) -> None:
+    """A client goes on by itself, and what it returns is the whole, in order."""
+    made = make_map(tmp_path / "many", columns=17, rows=17, points=5)
+    every, layers = sorted(map(made.id, made.corners)), ("voxel(leaf=1.0)", "points")
+    everywhere = shmmap.Box(-1e4, -1e4, 1e4, 1e4)
+    with connect(daemon(made.root).endpoint) as client:
+        cold = client.area(everywhere, wait=0.0)
+        assert {cell.id for cell in cold.pending} | {cell.id for cell in cold.cells} == set(every)
+        whole = client.area(everywhere, wait=300.0)
+        assert [cell.id for cell in whole.cells] == every
+        assert (whole.pending, whole.failed, whole.complete) == ((), (), True)
+        two = client.area(everywhere, layers, wait=300.0)
+        assert [(cell.id, cell.layer) for cell in two] == [
+            (cell, layer) for cell in every for layer in layers
+        ]
+        held = whole.cells[::3]
+        del cold, whole, two
+        lacked = client.differential(everywhere, held, wait=300.0)
+        assert [cell.id for cell in lacked] == [cell for at, cell in enumerate(every) if at % 3]
+        assert lacked.removed == ()
+        west = sum(x < 0 for x, _ in made.corners.values())
+        part = client.differential(shmmap.Box(-1e4, -1e4, -1.0, 1e4), [*held, *lacked.cells], wait=300.0)
+        assert (len(part.cells), len(part.removed)) == (0, len(every) - west)
+        ids = [*every[::-1], *every[:50], "no such cell", "0_0.pcd"]
+        some = client.selected(ids, layers, wait=300.0)
+        assert [(cell.id, cell.layer) for cell in some] == [
+            (made.id(Path(cell).name), layer) for cell in ids if cell != "no such cell" for layer in layers
+        ]
+        assert [error.code for error in some.failed] == ["unknown_cell"] * 2
+
+
+def test_the_map_changes_between_two_replies(daemon: Factory, tmp_path: Path) -> None:
+    """A cell that was pending is gone when it is asked for again, one behind is removed, one is new."""
+    made = make_map(tmp_path / "many", columns=13, rows=13, points=5)
+    every = sorted(made.corners)
+    with shmmap.connect(daemon(made.root).endpoint) as client:
+        session, before = client.session, client.map_version
+        area = messages.BoxMessage(-1e4, -1e4, 1e4, 1e4)
+        steps = session.cells(
+            lambda n, start, left_s: messages.Area(n, area, ("points",), left_s, None, start), LONG_S
+        )
+        asked = next(steps)
+        first = session.ask(asked.make, asked.kind)
+        assert len(first.pending) == 128
+        made.remove_cell(every[3])
+        made.remove_cell(every[-2])
+        made.write_cell("zz.pcd", (900, 900), random_points(np.random.default_rng(1), (900, 900), 9))
+        made.write_metadata()
+        after = client.reload().map_version
+        asked = steps.send(first)
+
+        def rest() -> Any:
+            now = asked
+            while True:
+                try:
+                    now = steps.send((yield now))
+                except StopIteration as end:  # noqa: PERF203  the steps end with their answer
+                    return end.value
+
+        found = session.run(rest())
+        assert names(found) == sorted(made.corners)
+        assert (found.complete, found.map_version) == (True, before)
+        assert before != after == client.differential(shmmap.Circle(0, 0, 1), ()).map_version
 
 
 def test_everything_says_what_it_is(standing: DaemonProcess, standing_map: DividedMap) -> None:
@@ -537,11 +605,14 @@ def test_a_request_that_no_daemon_takes_is_refused_before_it_is_sent(standing: D
     """It would end the connection; the error names the limit, and the client goes on."""
     with shmmap.connect(standing.endpoint) as client:
         session = client.welcome.session
-        for ids in (["x" * (5 << 20)], [f"{number:0100}.pcd" for number in range(45_000)]):
-            for ask in (client.selected, client.evict):
-                with pytest.raises(BadRequest, match="bytes; 4,194,304 are the most") as refused:
-                    ask(ids)
-                assert "some ids at a time" in refused.value.hint
+        for ask, ids in (
+            (client.selected, ["x" * (5 << 20)]),
+            (client.evict, ["x" * (5 << 20)]),
+            (client.evict, [f"{number:0100}.pcd" for number in range(45_000)]),
+        ):
+            with pytest.raises(BadRequest, match="bytes; 4,194,304 are the most") as refused:
+                ask(ids)
+            assert "some ids at a time" in refused.value.hint
         held = [(f"{number:0100}.pcd", 1) for number in range(45_000)]
         with pytest.raises(BadRequest, match="4,194,304"):
             client.differential(shmmap.Circle(0.0, 0.0, 5.0), held)

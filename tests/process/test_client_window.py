@@ -84,6 +84,27 @@ def test_every_step_is_the_set_difference(
 
 
 @pytest.mark.parametrize("kind", KINDS)
+def test_more_cells_than_one_reply_has(daemon: Factory, tmp_path: Path, kind: str, make: MakeWindow) -> None:
+    """Cold, warm, and after a step that most of the cells stay for."""
+    made = make_map(tmp_path / "many", columns=17, rows=17, points=5)
+    with make(daemon(made.root).endpoint, 150, layers=("points", "voxel(leaf=1.0)")) as window:
+        for x in (-100.0, 0.0):
+            window.move_to(x, 0.0, wait=LONG_S)
+            inside = {
+                (made.id(name), layer)
+                for name in made.in_circle(x, 0.0, 150)
+                for layer in ("points", "voxel(leaf=1.0)")
+            }
+            assert len(inside) > 128
+            assert {(cell.id, cell.layer) for cell in window.cells} == inside
+            assert window.complete
+    with make(daemon(made.root).endpoint, 1000) as window:
+        window.move_to(0.0, 0.0, wait=LONG_S)
+        assert [cell.id for cell in window.cells] == sorted(map(made.id, made.corners))
+        assert not window.move_to(200.0, 0.0, wait=LONG_S).any
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_reload_mid_drive(daemon: Factory, divided_map: DividedMap, kind: str, make: MakeWindow) -> None:
     one = daemon(divided_map.root)
     rng = np.random.default_rng(3)

@@ -129,7 +129,7 @@ def test_the_bytes_of_the_page() -> None:
 def test_everything_can_be_sent_at_once(standing: DaemonProcess, plain: Plain) -> None:
     """Greeting, ready and requests, without waiting for anything; also byte by byte."""
     one = plain(standing, hello=False)  # it has sent greeting and ready, and has not waited for a ready
-    numbers = [one.send("hello", 2, 0), one.send("metadata"), one.send("stats")]
+    numbers = [one.send("hello", 3, 0), one.send("metadata"), one.send("stats")]
     assert [one.reply_to(n)[0] for n in numbers] == ["welcome", "metadata_page", "stats_reply"]
     (ready,) = one.commands
     assert ready.startswith(b"\x05READY")
@@ -216,17 +216,17 @@ def test_events(served: DaemonProcess, plain: Plain) -> None:
 @pytest.mark.parametrize("minor", [0, 99])
 def test_every_minor_version_is_answered(standing: DaemonProcess, plain: Plain, minor: int) -> None:
     one = plain(standing, hello=False)
-    assert one.hello(minor=minor)[2:4] == [2, 2]
+    assert one.hello(minor=minor)[2:4] == [3, 0]
     cells = one.ask("area", HERE, ["points"], 30.0)
     assert [handle[0] for handle in cells[4]] == FOUR
     assert cells[5:9] == [[], b"", [], []]
-    assert len(cells) == 12
+    assert (len(cells), cells[12]) == (13, "")
 
 
 def test_what_the_daemon_does_not_know(one: PlainClient) -> None:
     assert refusal(one, "of_a_later_version", 1, 2) == "bad_request"
-    assert one.ask("area", HERE, ["points"], 30.0, None, "new", {"a": 1})[0] == "cells"
-    assert refusal(one, "hello", 3, 0) == "protocol_mismatch"
+    assert one.ask("area", HERE, ["points"], 30.0, None, "", "new", {"a": 1})[0] == "cells"
+    assert refusal(one, "hello", 4, 0) == "protocol_mismatch"
     one.send_frame(b"\xc1")
     with pytest.raises(Refused) as refused:
         one.reply_to(0)
@@ -263,7 +263,7 @@ def test_layers_in_canonical_form(one: PlainClient) -> None:
     handles = [(handle[0], handle[2]) for handle in reply[4]]
     assert handles == [(name, layer) for name in FOUR for layer in ("points", canonical)]
     reply = one.ask("selected", ["0_0.pcd", FOUR[0], "0_0.pcd"], [canonical, "points", "points"], 30.0)
-    assert reply[9:] == [[canonical, "points", "points"], True, ""]
+    assert reply[9:] == [[canonical, "points", "points"], True, "", ""]
     assert [handle[0] for handle in reply[4]] == [
         name for name in ("0_0.pcd", FOUR[0], "0_0.pcd") for _ in "ab"
     ]

@@ -11,16 +11,11 @@ import socket
 import stat
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 
 import shmmap
-from shmmap.client.map_listing import list_segments
-from shmmap.errors import ProtocolMismatch
 from shmmap.statistics.reader import read_statistics
 from shmmap.version import build_version
 from tests.process.conftest import DaemonFactory
@@ -191,9 +186,6 @@ def test_what_is_in_memory_is_listed(served: DaemonProcess, divided_map: Divided
         assert after["0_0.pcd"].hits == before["0_0.pcd"].hits + 3
         assert after["0_0.pcd"].last_use_monotonic_ns > before["0_0.pcd"].last_use_monotonic_ns
         assert {**after, "0_0.pcd": before["0_0.pcd"]} == before
-        older: Any = SimpleNamespace(welcome=msgspec.structs.replace(client.welcome, minor=1))
-    with pytest.raises(ProtocolMismatch, match=r"2\.1: it cannot list"):
-        list_segments(older)
 
 
 def test_nothing_is_open_to_others_without_a_group(served: DaemonProcess, connect: Connect) -> None:

@@ -14,13 +14,11 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 
 import shmmap as library
-from shmmap.errors import PackageMissing, ProtocolMismatch
-from shmmap.viewing.browser.live_view import refuse_older
+from shmmap.errors import PackageMissing
 from tests.process.conftest import DaemonFactory
 from tests.support.cloud_bytes import write_las
 from tests.support.command_line import Shmmap
@@ -218,14 +216,6 @@ def test_hostile_names(standing: DaemonProcess) -> None:
         seen(page, lambda: any("<b>x</b>" in one.get("options", ()) for one in page.texts.values()))
         options = [one["options"] for one in page.texts.values() if "options" in one]
         assert [sorted(one) for one in options] == [["<b>x</b>", "no client", "twice"]]
-
-
-def test_an_older_daemon_is_not_looked_at(standing: DaemonProcess) -> None:
-    """It ignores that a request is spare."""
-    with library.connect(standing.endpoint, shm_dir=standing.shm_dir) as client:
-        refuse_older(client.welcome)
-        with pytest.raises(ProtocolMismatch, match=r"speaks protocol 2\.0"):
-            refuse_older(msgspec.structs.replace(client.welcome, minor=0))
 
 
 def test_a_killed_daemon_and_a_changed_cell(daemon: DaemonFactory, divided_map: DividedMap) -> None:

@@ -168,7 +168,7 @@ class PlainClient:
 
     def hello(self, *, minor: int = 0, name: str = "plain", session: int = 0) -> list[Any]:
         """Open the session; Use what this `welcome` says from now on."""
-        welcome = self.ask("hello", 2, minor, name, session)
+        welcome = self.ask("hello", 3, minor, name, session)
         self.epoch, self.session, self.map_version = welcome[6:9]
         self.shm_dir, self.id_prefix, self.segment_prefix = welcome[11:14]
         self.events = welcome[19]

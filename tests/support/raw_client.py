@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+import time
+from dataclasses import dataclass, replace
 from typing import Any
 
 import zmq
@@ -24,6 +25,10 @@ HANDLE = (
     "max_x",
     "max_y",
 )
+
+
+SELECTED = 128
+"""As many cells as one request names."""
 
 
 @dataclass
@@ -92,6 +97,19 @@ def circle(x: float, y: float, radius: float, z: tuple[float, float] | None = No
 def square(x: float, y: float, radius: float) -> list[Any]:
     """Autoware's square on the wire."""
     return ["square", x, y, radius]
+
+
+def joined(parts: list[RawCells]) -> RawCells:
+    """The replies to the parts of one request, as one."""
+    *_, last = parts
+    return replace(
+        last,
+        map_version=parts[0].map_version,
+        cells=[cell for part in parts for cell in part.cells],
+        pending=[cell for part in parts for cell in part.pending],
+        failed=[cell for part in parts for cell in part.failed],
+        wire_bytes=sum(part.wire_bytes for part in parts),
+    )
 
 
 class RawClient:
@@ -171,7 +189,7 @@ class RawClient:
 
     def hello(self) -> list[Any]:
         """Open the session."""
-        welcome = self.ask("hello", 2, 0, self.name)
+        welcome = self.ask("hello", 3, 0, self.name)
         assert welcome[0] == "welcome"
         (
             _,
@@ -226,9 +244,23 @@ class RawClient:
             self.last_bytes,
         )
 
+    def all_cells(self, wait: float | None, tag: str, *elements: Any) -> RawCells:
+        """Ask reply after reply, and from the beginning while something is pending and ``wait`` lasts."""
+        end_s = time.monotonic() + (wait or 0.0)
+        while True:
+            parts: list[RawCells] = []
+            start = ""
+            while start or not parts:
+                reply = self.ask(tag, *elements, start)
+                parts.append(self.cells_reply(reply))
+                start = reply[12]
+            whole = joined(parts)
+            if len(parts) == 1 or not whole.pending or time.monotonic() >= end_s:
+                return whole
+
     def area(self, area: list[Any], *, wait: float | None = 30.0, intent: Any = None) -> RawCells:
         """Ask for an area."""
-        return self.cells_reply(self.ask("area", area, ["points"], wait, intent))
+        return self.all_cells(wait, "area", area, ["points"], wait, intent)
 
     def differential(
         self,
@@ -240,13 +272,13 @@ class RawClient:
         intent: Any = None,
     ) -> RawCells:
         """Ask for an area less what is held; ``held`` rows are [id], [id, version], ..."""
-        return self.cells_reply(
-            self.ask("differential", area, ["points"], held or [], pack_versions(packed or []), wait, intent)
-        )
+        versions = pack_versions(packed or [])
+        return self.all_cells(wait, "differential", area, ["points"], held or [], versions, wait, intent)
 
     def selected(self, ids: list[str], *, wait: float | None = 30.0) -> RawCells:
-        """Ask for cells by id."""
-        return self.cells_reply(self.ask("selected", ids, ["points"], wait))
+        """Ask for cells by id, some at a time."""
+        parts = [ids[at : at + SELECTED] for at in range(0, len(ids), SELECTED)] or [[]]
+        return joined([self.cells_reply(self.ask("selected", part, ["points"], wait)) for part in parts])
 
     def release(self, versions: list[int] | None = None) -> None:
         """Report to the daemon what was unmapped."""

@@ -19,7 +19,7 @@ from shmmap.client.window.retention import RetentionCandidate, RetentionPolicy
 from shmmap.client.window.state import LayerKey, WindowState
 from shmmap.errors import BadRequest, OverBudget
 from shmmap.geometry import distance_to_boxes
-from shmmap.protocol.messages import Intent
+from shmmap.protocol.messages import MAX_NAMED, Intent
 
 _Shape: TypeAlias = type[geometry.Circle] | type[geometry.AutowareSquare]
 
@@ -143,7 +143,7 @@ class WindowRefresher:
     def _ask(
         self, state: WindowState, area: geometry.Area, pose: Intent, wait_s: float | None, *, by_name: bool
     ) -> Steps[CellSet]:
-        held = HeldCells(state.cells.values(), by_name=by_name)
+        held = HeldCells(state.cells.values(), by_name=by_name and len(state.cells) <= MAX_NAMED)
         return self._client.session.differential(
             area, held, self._layers, wait_s, pose, populate=self._populate, timeout_s=self._timeout_s
         )

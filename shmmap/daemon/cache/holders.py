@@ -4,13 +4,13 @@
 A query for one segment takes about 30 us, and there may be thousands of segments.  A continuous walk over all
 of them, one step per beat, keeps the gauges of the statistics up to date.  When a session asks, a new walk
 begins and runs one step in every turn of the loop; all sessions that asked before it began get its result.
-Before a request is refused for its session's quota, its own steps look up what that session maps.
+Before a request is refused for its session's quota, some of what that session maps is looked up.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Container, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from typing import Final
@@ -24,10 +24,12 @@ from shmmap.errors import Busy
 from shmmap.protocol.messages import Holder
 from shmmap.segment.pins import LOADER_SLOT, has_slot, holders
 
-HOLDERS_S: Final = 0.03
-"""Limit of processor time for finding the holders for one reply."""
-MAX_HOLDING_SEGMENTS: Final = 512
-"""Segments queried for one reply."""
+HOLDERS_S: Final = 0.003
+"""Limit of processor time for finding holders for one reply."""
+MAX_HOLDING_SEGMENTS: Final = 256
+"""Segments queried for one reply, the largest."""
+MAX_LOOKS: Final = 128
+"""Segments of a session that are checked before one request is refused for its quota."""
 UNKNOWN_SLOT: Final = 0
 """Stands for processes that use a segment without having a session."""
 ASKING_S: Final = 0.2
@@ -36,7 +38,7 @@ LONG_STEP_S: Final = 0.003
 SHARE: Final = 0.1
 """Share of the loop's time for steps that take long (when a process holds very many locks)."""
 MAX_SEGMENTS: Final = 2048
-"""Limit of a walk that a session waits for (largest first) and of one session's check (oldest first)."""
+"""Limit of a walk that a session waits for (largest first)."""
 MAX_ASKED: Final = 16
 """Results that one session may wait for at a time."""
 
@@ -85,23 +87,17 @@ class Holders:
         """Return the holders of a segment; session 0 is "unknown": a pin without a lock of shmmap."""
         return tuple(self._as_holders({slot: [resident.nbytes, 1] for slot in self._users_of(resident)}))
 
-    def look(self, found: list[Holder]) -> Iterator[None]:
-        """Find the holders of most memory, one segment a step; the last step fills ``found``, largest first.
-
-        The number of segments and the time for them are bounded.
-        """
-        spent_s, sums_of = 0.0, dict[int, list[int]]()
+    def largest(self, most: int) -> tuple[Holder, ...]:
+        """Return the holders of most memory, largest first, as far as the largest segments show them."""
+        end_s, sums_of = time.thread_time() + HOLDERS_S, dict[int, list[int]]()
         for resident in islice(self.reclaimer.ledger.segments.walk(), MAX_HOLDING_SEGMENTS):
-            begin_s = time.thread_time()
             for slot in self._users_of(resident):
                 sums = sums_of.setdefault(slot, [0, 0])
                 sums[0] += resident.nbytes
                 sums[1] += 1
-            spent_s += time.thread_time() - begin_s
-            if spent_s > HOLDERS_S:
+            if time.thread_time() > end_s:
                 break
-            yield
-        found += self._as_holders(sums_of)
+        return tuple(self._as_holders(sums_of)[:most])
 
     def _users_of(self, resident: Resident) -> list[int]:
         return self.users_among(resident, self.slots_of(resident) or ())
@@ -203,25 +199,24 @@ class Survey:
 
     def look_at(
         self, session: Session, before_s: float, enough: Callable[[], bool], wanted: Container[Key]
-    ) -> Generator[None, None, None]:
-        """Drop segments that a session no longer maps, checking one per step, until ``enough()`` is True.
+    ) -> None:
+        """Drop segments that a session no longer maps, until ``enough()``; a bounded number is checked.
 
-        Segments handed out at ``before_s`` or later stay, since the session may be about to open them;
-        ``wanted`` keys stay in any case.
+        The next call begins with others.  Segments handed out at ``before_s`` or later stay, since the
+        session may be about to open them; ``wanted`` keys stay in any case.
         """
         if not self._holders.by_slot:
             return
-        looked = 0
-        for version in list(session.held):  # in the order in which they were handed out
-            for resident in list(session.held.get(version, ())):
-                if looked == MAX_SEGMENTS or enough():
-                    return
-                if resident.key in wanted:
-                    continue
-                looked += 1
-                if resident.last_use_s < before_s and not self._holders.has(resident, session.slot):
+        end_s = time.thread_time() + HOLDERS_S
+        for version in list(islice(session.held, MAX_LOOKS)):  # those checked longest ago
+            if enough() or time.thread_time() > end_s:
+                return
+            for resident in list(session.held[version]):
+                is_wanted = resident.key in wanted or resident.last_use_s >= before_s
+                if not is_wanted and not self._holders.has(resident, session.slot):
                     session.drop_segment(resident)
-                yield
+            if version in session.held:
+                session.held[version] = session.held.pop(version)
 
     def step(self) -> None:
         """Query some segments, or pass the result to one session that asked."""

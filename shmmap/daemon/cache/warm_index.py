@@ -52,12 +52,11 @@ class Heights:
         z_min, z_max = self._z[index].tolist()
         return z_min, z_max
 
-    def overlapping(self, indices: list[int], z: tuple[float, float]) -> list[int]:
+    def overlapping(self, cells: NDArray[np.intp], z: tuple[float, float]) -> NDArray[np.intp]:
         """Return the cells that may overlap a height range: all but those known to lie outside it."""
-        cells = np.array(indices, dtype=np.intp)
         z_min, z_max = self._z[cells].T
         outside = self._known[cells] & ((z_max < z[0]) | (z_min > z[1]))
-        inside: list[int] = cells[~outside].tolist()
+        inside: NDArray[np.intp] = cells[~outside]
         return inside
 
 

@@ -1,84 +1,108 @@
 # SPDX-License-Identifier: Apache-2.0
 """Requests for cells: area, differential and selected.
 
-A request first becomes a `PendingRequest`: which cells in which order, minus those that the client holds.
-If all of them are warm, the answer leaves at once.  Otherwise loads are queued, nearest cells first, and the
-answer leaves when the last load has ended or the client's timeout expires.  It contains a handle for each
-cell in memory, and a reason for each other cell.  Work on many cells takes several turns of the loop.
+A reply has a bounded number of cells, and begins a bounded number of loads; with more, it says where the
+client has to go on.  So an attempt to answer a request (`CellRequests._attempt`) is one step of bounded time:
+it finds the cells in the map that is served now, queues loads of those that are cold, nearest first, and
+either answers or lets the request wait.  When its last load has ended, a page of the map has come or its time
+is over, the next attempt begins with the message again, so nothing that the last one found can be outdated.
 """
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Generator, Iterable, Iterator
+import bisect
+from collections import deque
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import islice
-from typing import Final, TypeVar
+from typing import Final
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.loading.loads import Load
 from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.map.catalogue_view import PageNews
-from shmmap.daemon.records import SPACE_CODES, Resident
+from shmmap.daemon.records import SPACE_CODES, Key, Resident
 from shmmap.daemon.requests import limits
-from shmmap.daemon.requests.differential import difference, warm_difference
-from shmmap.daemon.requests.pending_request import LARGE, Found, MapChanged, PendingRequest, WaitingList
+from shmmap.daemon.requests.differential import WarmDifference, difference, is_among, warm_difference
+from shmmap.daemon.requests.waiting_list import CellRequest, Message, WaitingList
 from shmmap.daemon.transport.connection import Connection
 from shmmap.daemon.transport.sessions import Session
-from shmmap.daemon.turns import Pace, batched
+from shmmap.daemon.turns import Walk
 from shmmap.errors import BadRequest, ShmmapError
-from shmmap.geometry import Area
+from shmmap.geometry import Area, distance_to_boxes
 from shmmap.protocol import messages
-from shmmap.protocol.codec import PackedArray, encode_cells
-from shmmap.protocol.messages import FailedCell, Holder, PendingCell
+from shmmap.protocol.codec import encode_cells
+from shmmap.protocol.messages import Differential, FailedCell, Holder, PendingCell, Selected
 
+MAX_CELLS: Final = 512
+"""Layers of cells in one reply (a warm one takes some 5 us), and those of one more cell."""
+MAX_COLD: Final = 128
+"""Layers of cells among them that are not in memory (one takes some 18 us)."""
+MAX_ATTEMPTS: Final = 4
+"""Attempts that may end in waiting, besides those after a page of the map; the next one is the answer."""
 MAX_WAIT_S: Final = 3600.0
 MAX_COMPARED: Final = 4096
-"""Cells of an area compared in one turn with those that a client holds, if all are in memory."""
-MAX_LOOKED_AT: Final = 20_000
-"""Cells of unanswered requests that are searched for a page of the map; with more, the page is kept."""
-PACKED_PER_CELL: Final = 256
-HELD_PER_CELL: Final = 2
-"""Bytes of packed versions, and cells held by name, that count as one cell of a waiting request's memory."""
+"""Cells of an area that are compared with those that a client holds, if all are in memory."""
+MAX_LOOKED_AT: Final = 256
+"""Waiting requests that are searched for a page of the map; with more, the page is kept."""
 MAX_HOLDERS: Final = 16
 """Holders named beside each cell that does not fit: those with the most memory."""
-NOTED_PER_STEP: Final = 256
-"""Cells handed out that are noted, or freed, between two looks at the time."""
-PROMISED: Final = 1e9
-"""Priority of a load promised by a "pending" alone: after the distances of all requested cells."""
 
 _UNNAMED: Final = (Holder(0, 0, -1, "", 0, 0),)
 """Stands for the holders of memory until they are looked up."""
 
-Result = TypeVar("Result")
+
+@dataclass(eq=False, slots=True)
+class _Found:
+    """What a request asks for in the map that is served now.
+
+    Attributes
+    ----------
+    cells
+        Catalogue index and layer of each handle to send, in reply order.
+    next_id
+        Id of the cell after which the client has to go on, as replies carry it; empty if these are all.
+    covered, reason
+        Whether all cells of the requested area are known; if not, why the request does not wait for the rest.
+    pages
+        Pages of the map that may list more cells of the request.
+    removed, removed_packed
+        Cells that the client should drop, as the reply encodes them.
+    unknown
+        Ids that the map does not contain, with the requested layers.
+    held, held_old
+        Versions that the client holds, ascending; layers of cells that it holds in an outdated version.
+    """
+
+    cells: list[tuple[int, str]] = field(default_factory=list)
+    next_id: str = ""
+    covered: bool = True
+    reason: str = ""
+    pages: set[int] = field(default_factory=set)
+    removed: tuple[str, ...] = ()
+    removed_packed: bytes = b""
+    unknown: list[tuple[str, str]] = field(default_factory=list)
+    held: NDArray[np.uint64] = field(default_factory=lambda: np.zeros(0, np.uint64))
+    held_old: Collection[Key] = ()
 
 
 @dataclass(eq=False, slots=True)
 class _Answer:
-    """Cells of a reply.
-
-    Attributes
-    ----------
-    handles, pending
-        Cells that `encode` has not encoded yet.
-    failed
-        Failed cells; the holders of memory are added later.
-    """
+    """Cells of a reply; ``outstanding`` are the loads that may bring more."""
 
     residents: list[Resident] = field(default_factory=list)
     handles: list[bytes] = field(default_factory=list)
     pending: list[PendingCell] = field(default_factory=list)
     failed: list[FailedCell] = field(default_factory=list)
-    encoded_handles: PackedArray = field(default_factory=PackedArray)
-    encoded_pending: PackedArray = field(default_factory=PackedArray)
+    outstanding: set[Key] = field(default_factory=set)
 
-    def encode(self) -> None:
-        """Encode the cells added since the last call: encoding very many at once takes long."""
-        self.encoded_handles.add_encoded(self.handles)
-        self.encoded_pending.add(self.pending)
-        self.handles, self.pending = [], []
+    def add(self, resident: Resident, *, stale: bool = False) -> None:
+        """Add a segment that is in memory."""
+        self.residents.append(resident)
+        self.handles.append(resident.stale_handle if stale else resident.handle)
 
 
 class CellRequests:
@@ -91,7 +115,7 @@ class CellRequests:
     quota_bytes
         Limit of the bytes that one session alone holds.
     due
-        Queues the steps that answer a request, to run in the turns of the connection's process.
+        Queues the next attempt to answer a request, to run in the turns of the connection's process.
     clock
         The serving loop's clock, seconds.
     """
@@ -108,503 +132,401 @@ class CellRequests:
     ) -> None:
         self._cache = cache
         self._scheduler = scheduler
-        self._statistics, self._holders = cache.statistics, cache.holders
+        self._statistics = cache.statistics
         self._due = due
         self._now_s = clock
         self._quota = limits.SessionQuota(quota_bytes, cache, clock)
-        self._open: dict[PendingRequest, None] = {}  # not answered yet
         self._waiting = waiting
+        self._leftovers: deque[Iterator[None]] = deque()
 
     def __len__(self) -> int:
         return len(self._waiting)
 
-    # --- the three verbs ------------------------------------------------------------------------
-
-    def area(self, session: Session, message: messages.Area) -> Iterator[None]:
-        """Answer with all cells that intersect an area."""
-        _check_wait(message.wait)
-        area = messages.area_from_message(message.area)
-        layers = self._layers(message.layers)
-        _note_area(session, area, layers)
-
-        def find(wanted: PendingRequest) -> Generator[None, None, None]:
-            known = yield from self._known(wanted, layers)
-            for indices in batched(known):
-                yield from wanted.pause()
-                wanted.found.cells += [(index, layer) for index in indices for layer in layers]
-
-        return self._serve(self._pending(session, message, find, area), message.wait)
-
-    def selected(self, session: Session, message: messages.Selected) -> Iterator[None]:
-        """Answer with cells by id, in the order of the request."""
-        _check_wait(message.wait)
-        layers = self._layers(message.layers)
-        limits.check_count(len(message.ids) * len(layers))
-
-        def find(wanted: PendingRequest) -> Generator[None, None, None]:
-            found = wanted.found
-            for ids in batched(message.ids):
-                yield from wanted.pause()
-                for cell_id in ids:
-                    index = self._cache.index_of(cell_id)
-                    if index is not None:
-                        found.cells += [(index, layer) for layer in layers]
-                    else:
-                        found.unknown += [(cell_id, layer) for layer in layers]
-            found.covered = not found.unknown or self._cache.catalogue.complete
-
-        wanted = self._pending(session, message, find, None, len(message.ids))
-        wanted.spare = message.spare
-        return self._serve(wanted, message.wait)
-
-    def differential(self, session: Session, message: messages.Differential) -> Iterator[None]:
-        """Answer with the cells that intersect an area, minus those that the client holds."""
-        limits.check_held(message)
-        _check_wait(message.wait)
-        area = messages.area_from_message(message.area)
+    def serve(self, session: Session, message: Message) -> None:
+        """Answer a request with the cells that are in memory, or let it wait for loads and pages."""
+        wait_s = message.wait
+        if wait_s is not None and not 0 <= wait_s <= MAX_WAIT_S:
+            raise BadRequest(f"wait must be between 0 and {MAX_WAIT_S:.0f} seconds, not {wait_s!r}")
         layers = limits.layers_of(message.layers)
-        catalogue, versions = self._cache.catalogue, self._cache.layers
-        cells, covered = catalogue.query(area, MAX_COMPARED)
-        looks_around = catalogue.pages is not None and versions.halo_m(layers) > 0.0
-        is_one = len(layers) == 1 and area.z is None
-        if is_one and covered and not looks_around and len(cells) <= MAX_COMPARED:
-            warm = warm_difference(self._cache, message, cells, layers[0])
-            if warm is not None and self._quota.has_room(session, warm.residents):
-                _note_area(session, area, layers)
-                answer = _Answer(warm.residents, [resident.handle for resident in warm.residents])
-                found = Found(removed=warm.removed, removed_packed=warm.removed_packed)
-                self._reply(session, message.request, limits.layers_named(message.layers), answer, found)
-                # the bookkeeping can wait until the answer is out
-                self._statistics.add("hits", len(answer.residents))
-                return self._hand_out(session, answer, Pace())
-        self._check_reach(layers)
-        _note_area(session, area, layers)
-
-        def find(wanted: PendingRequest) -> Generator[None, None, None]:
-            yield from wanted.pause(now=len(cells) > MAX_COMPARED)  # finding them all takes a turn
-            known = yield from self._known(wanted, layers)
-            yield from difference(wanted, message, known, layers)
-
-        held_cells = len(message.packed) // PACKED_PER_CELL + len(message.held) // HELD_PER_CELL
-        return self._serve(self._pending(session, message, find, area, held_cells), message.wait)
-
-    def _pending(
-        self,
-        session: Session,
-        message: messages.Area | messages.Differential | messages.Selected,
-        find: Callable[[PendingRequest], Iterator[None]],
-        area: Area | None,
-        message_cells: int = 0,
-    ) -> PendingRequest:
-        layers = limits.layers_named(message.layers)
-        return PendingRequest(self._cache, session, message.request, layers, find, area, message_cells)
-
-    def _layers(self, specs: tuple[str, ...]) -> tuple[str, ...]:
-        layers = limits.layers_of(specs)
-        self._check_reach(layers)
-        return layers
-
-    def _check_reach(self, layers: tuple[str, ...]) -> None:
-        versions = self._cache.layers
+        area = None
+        if isinstance(message, Selected):
+            limits.check_selected(message, layers)
+        else:
+            area = messages.area_from_message(message.area)
+        if isinstance(message, Differential):
+            limits.check_held(message)
+            if self._answer_warm(session, message, area, layers):
+                return
         for layer in layers:
-            versions.check_reach(layer)
+            self._cache.layers.check_reach(layer)
+        if area is not None:
+            _note_area(session, area, layers)
+        now_s = self._now_s()
+        self._attempt(CellRequest(session, message, layers, area, now_s, now_s + (wait_s or 0.0)))
 
-    def _known(self, wanted: PendingRequest, layers: tuple[str, ...]) -> Generator[None, None, list[int]]:
-        """Find the known cells of an area; note whether more may exist, and the pages that may list them.
+    def release(self, residents: Sequence[Resident]) -> None:
+        """Release segments that a client has dropped."""
+        self._scheduler.room.release(residents, self._now_s())
 
-        A layer that reads neighbouring cells needs the pages of these, too.
+    # --- finding --------------------------------------------------------------------------------
+
+    def _answer_warm(
+        self, session: Session, message: Differential, area: Area | None, layers: tuple[str, ...]
+    ) -> bool:
+        """Answer a differential request at once if it names versions and all cells are in memory."""
+        cache = self._cache
+        if len(layers) > 1 or message.start or area is None or area.z is not None:
+            return False
+        cells, covered = cache.catalogue.query(area, MAX_COMPARED)
+        looks_around = cache.catalogue.pages is not None and cache.layers.halo_m(layers) > 0.0
+        if not covered or looks_around or len(cells) > MAX_COMPARED:
+            return False
+        warm: WarmDifference | None = warm_difference(cache, message, cells, layers[0])
+        if warm is None or len(warm.residents) > MAX_CELLS:
+            return False
+        if not self._quota.has_room(session, warm.residents):
+            return False
+        _note_area(session, area, layers)
+        answer = _Answer(warm.residents, [resident.handle for resident in warm.residents])
+        found = _Found(removed=warm.removed, removed_packed=warm.removed_packed)
+        self._reply(session, message, found, answer)
+        self._statistics.add("hits", len(answer.residents))
+        self._hand_out(session, answer)
+        return True
+
+    def _find(self, request: CellRequest) -> _Found:
+        """Find the cells of a reply.
 
         Raises
         ------
         BadRequest
             The area has too many cells.
-        MapChanged, NoSession
-            See `PendingRequest.pause`.
         """
-        area, found, catalogue = wanted.area, wanted.found, self._cache.catalogue
-        assert area is not None  # noqa: S101  only requests by ids have no area
+        message, found = request.message, _Found()
+        if isinstance(message, Selected):
+            self._find_selected(message, request.layers, found)
+            return found
+        area, layers = messages.area_from_message(message.area), request.layers
+        cells = self._cells_in(area, layers, found)
+        start = self._place_after(message.start, cells)
+        if isinstance(message, Differential):
+            lacks = difference(
+                self._cache, message, cells, layers, start=start, most=MAX_CELLS, covered=found.covered
+            )
+            found.cells, found.held, found.held_old = lacks.cells, lacks.held, lacks.held_old
+            found.removed, found.removed_packed = lacks.removed, lacks.removed_packed
+            end = start + lacks.looked_at
+        else:
+            end = min(len(cells), start + max(1, MAX_CELLS // len(layers)))
+            found.cells = [(index, layer) for index in cells[start:end].tolist() for layer in layers]
+        if end < len(cells):
+            found.next_id = self._wire_id(int(cells[end - 1]))
+        return found
+
+    def _find_selected(self, message: Selected, layers: Sequence[str], found: _Found) -> None:
+        for cell_id in message.ids:
+            index = self._cache.index_of(cell_id)
+            if index is not None:
+                found.cells += [(index, layer) for layer in layers]
+            else:
+                found.unknown += [(cell_id, layer) for layer in layers]
+        found.covered = not found.unknown or self._cache.catalogue.complete
+
+    def _cells_in(self, area: Area, layers: Sequence[str], found: _Found) -> NDArray[np.intp]:
+        """Return the known cells of an area; note whether more may exist, and the pages that may list them.
+
+        A layer that reads neighbouring cells needs the pages of these, too.
+        """
+        cache, catalogue = self._cache, self._cache.catalogue
         pages = catalogue.pages
         if pages is not None:
             limits.check_count(pages.cells_surely_in(area) * len(layers))
-        indices, found.covered = catalogue.query(area, limits.MAX_CELLS)
-        limits.check_count(len(indices) * len(layers))
+        cells, found.covered = catalogue.query(area, limits.MAX_CELLS)
+        limits.check_count(len(cells) * len(layers))
         if pages is not None:
-            needed = self._cache.pages_around(area, layers)
+            needed = cache.pages_around(area, layers)
             absent = [page for page in needed if not pages.is_here(page)]
             found.covered = not absent
             found.pages = {page for page in absent if not pages.is_out_of_reach(page)}
             found.reason = "offline" if len(found.pages) < len(absent) else ""
             pages.want(needed, 0.0)
-        yield from wanted.pause(now=len(indices) > LARGE)
-        known: list[int] = indices.tolist()
-        return known if area.z is None else self._cache.heights.overlapping(known, area.z)
+        return cells if area.z is None else cache.heights.overlapping(cells, area.z)
 
-    def release(self, residents: Iterable[Resident]) -> None:
-        """Release segments that a client has dropped."""
-        self._scheduler.room.release(residents, self._now_s())
+    def _wire_id(self, index: int) -> str:
+        return self._cache.wire_id(self._cache.catalogue.id(index))
 
-    # --- loading and waiting --------------------------------------------------------------------
+    def _place_after(self, cell_id: str, cells: NDArray[np.intp]) -> int:
+        """Return the place of the first cell behind an id, in id order."""
+        if not cell_id:
+            return 0
+        name = cell_id if cell_id.startswith("/") else self._cache.id_prefix + cell_id
+        of = self._cache.catalogue.id
+        return bisect.bisect_right(range(len(cells)), name, key=lambda place: of(int(cells[place])))
 
-    def _serve(self, wanted: PendingRequest, wait_s: float | None) -> Iterator[None]:
-        """Answer a request, or request loads of its cold cells and let it wait."""
-        waits = False
-        self._open[wanted] = None
-        try:
-            waits = yield from self._on_one_map(wanted, lambda: self._begin(wanted, wait_s))
-            if not waits:
-                yield from self._on_one_map(wanted, lambda: self._answer(wanted, may_wait=False))
-        finally:
-            if not waits:
-                self._end(wanted)
+    def _distances_m(self, request: CellRequest, cells: Sequence[tuple[int, str]]) -> list[float]:
+        """Return the distances of cells from the position that the client sent.
 
-    def _end(self, wanted: PendingRequest) -> None:
-        self._open.pop(wanted, None)
-        self._waiting.release(wanted)
-
-    def _on_one_map(
-        self, wanted: PendingRequest, do: Callable[[], Generator[None, None, Result]]
-    ) -> Generator[None, None, Result]:
-        """Run a step over a request's cells; find them again and repeat it if the map has changed."""
-        while True:
-            with contextlib.suppress(MapChanged):
-                yield from wanted.find_again()
-                return (yield from do())
-
-    def _begin(self, wanted: PendingRequest, wait_s: float | None) -> Generator[None, None, bool]:
-        """Load the cold cells of a request; return whether it waits for them, or for pages of the map."""
-        now_s = self._now_s()
-        may_wait = bool(wait_s) and self._waiting.has_room(wanted)
-        yield from self._have_loaded(wanted, note=may_wait)
-        if not (may_wait and wanted.waits):
-            return False
-        yield from self._need(wanted)
-        wanted.began_s, wanted.deadline_s = now_s, now_s + (wait_s or 0.0)
-        self._waiting.add(wanted)
-        self._wait_for_pages(wanted)
-        if wanted.outdated or not wanted.waits:  # finished while the other cells were handled
-            self._answer_in_turn(wanted)
-        return True
-
-    def _have_loaded(self, wanted: PendingRequest, *, note: bool) -> Iterator[None]:
-        """Request loads of the cold cells; with ``note``, the request waits for them."""
-        cache, warm, found, now_s = self._cache, self._cache.warm.layers, wanted.found, self._now_s()
-        found.refused.clear()
-        cold: list[tuple[int, str]] = []
-        sizes: list[int] = []
-        for cells in batched(found.cells):
-            yield from wanted.pause()
-            for cell in cells:
-                index, layer = cell
-                resident = warm[layer].get(index) if layer in warm else None
-                resident = resident or cache.find_warm(index, layer, now_s)
-                if resident is None:
-                    cold.append(cell)
-                sizes.append(cache.estimate(index, layer) if resident is None else resident.nbytes)
-        counts = not wanted.began_s and not wanted.spare
-        if counts:
-            self._statistics.add("hits", len(found.cells) - len(cold))
-        yield from wanted.pause(now=wanted.is_large)
-        yield from self._quota.check(wanted, sizes)
-        if cold:
-            yield from limits.check_queue(self._scheduler.loads, wanted, cold)
-            self._statistics.add("misses", len(cold) * counts)
-            yield from self._load(wanted, cold, note=note)
-        found.requested = True
-
-    def _load(self, wanted: PendingRequest, cold: list[tuple[int, str]], *, note: bool) -> Iterator[None]:
-        """Request loads of the ``cold`` cells; with ``note``, the request waits for them."""
-        warm, prefetcher, now_s = self._cache.warm, self._scheduler.prefetcher, self._now_s()
-        for cells in batched(cold):
-            yield from wanted.pause()
-            for (index, layer), distance in zip(cells, wanted.distances_m(cells), strict=True):
-                key = self._cache.key(index, layer)
-                if key in wanted.found.refused or warm.get(index, layer) is not None:
-                    continue  # another client may have had it loaded in the meantime
-                load: Load | None
-                if wanted.spare:
-                    load = self._scheduler.want_spare(index, layer, now_s, wanted.session.asker)
-                else:
-                    prefetcher.note_cold(wanted.session, key)
-                    load = self._scheduler.want(index, layer, distance, now_s, wanted.session.asker)
-                if load and note:
-                    self._waiting.wait_for(wanted, key)
-
-    def _need(self, wanted: PendingRequest) -> Iterator[None]:
-        """Protect all requested cells from eviction until the answer has left, except spare ones."""
-        if wanted.spare:
-            return
-        for cells in batched(wanted.found.cells):
-            yield from wanted.pause()
-            for index, layer in cells:
-                self._waiting.need(wanted, self._cache.key(index, layer))
-
-    def _wait_for_pages(self, wanted: PendingRequest) -> None:
-        """Let a request wait for its pages, except those that have finished since its cells were found."""
-        found, pages = wanted.found, self._cache.pages
-        if pages is not None and found.pages:
-            come = {page for page in found.pages if pages.is_here(page)}
-            found.pages -= come | {page for page in found.pages if pages.is_out_of_reach(page)}
-            wanted.outdated = wanted.outdated or bool(come)
-            self._waiting.wait_for_pages(wanted)
-
-    def _answer_in_turn(self, wanted: PendingRequest) -> None:
-        """Queue the answer to a waiting request; its cells stay protected from eviction until then."""
-        if self._waiting.take(wanted):
-            self._due(wanted.session.connection, self._answer_now(wanted))
-
-    def _answer_now(self, wanted: PendingRequest) -> Iterator[None]:
-        """Answer a waiting request, unless it has to wait for more."""
-        if wanted not in self._waiting:  # its session has ended
-            return
-        wanted.pace.begin()
-        waits = False
-        try:
-            waits = yield from self._on_one_map(wanted, lambda: self._look_again(wanted))
-            if waits:
-                self._waiting.put_back(wanted)
-                if wanted.outdated:  # pages arrived while its cells were handled
-                    self._answer_in_turn(wanted)
-        except ShmmapError as error:
-            wanted.session.connection.refuse(wanted.request, error)
-        finally:
-            if not waits and wanted in self._waiting:
-                self._waiting.remove(wanted)
-                self._end(wanted)
-
-    def _look_again(self, wanted: PendingRequest) -> Generator[None, None, bool]:
-        """Answer a request, or return True if it has to wait for more.
-
-        It waits for cells that were found again, or for a cell whose load has ended and that is cold again or
-        may fit now.
+        Without one, from the centre of the requested area; 0 for a request by ids.
         """
-        may_wait = self._now_s() < wanted.deadline_s
-        if not wanted.found.requested:
-            may_wait = self._waiting.recount(wanted) and may_wait
-            yield from self._have_loaded(wanted, note=may_wait)
-            if may_wait:
-                yield from self._need(wanted)
-                self._wait_for_pages(wanted)
-                if wanted.waits or wanted.outdated:
-                    return True
-        return (yield from self._answer(wanted, may_wait=may_wait))
+        intent, area = request.session.intent, request.area
+        if intent is None and area is None:
+            return [0.0] * len(cells)
+        boxes = self._cache.catalogue.boxes_of(np.array([index for index, _ in cells], dtype=np.intp))
+        x, y = (intent.x, intent.y) if intent is not None else area.center  # type: ignore[union-attr]
+        distances: list[float] = distance_to_boxes(x, y, boxes).tolist()
+        return distances
 
-    # --- answers --------------------------------------------------------------------------------
+    # --- answering and waiting ------------------------------------------------------------------
 
-    def _answer(self, wanted: PendingRequest, *, may_wait: bool) -> Generator[None, None, bool]:
-        """Send the cells that are in memory; with ``may_wait``, return True instead if more may arrive.
-
-        Raises
-        ------
-        MapChanged, NoSession
-            See `PendingRequest.pause`; nothing has been sent.
-        """
-        cache, warm, found, now_s = self._cache, self._cache.warm.layers, wanted.found, self._now_s()
-        if wanted.area is not None and wanted.area.z is not None:
-            inside = set(cache.heights.overlapping([index for index, _ in found.cells], wanted.area.z))
-            found.cells = [cell for cell in found.cells if cell[0] in inside]
-        answer = _Answer()
-        yield from wanted.pause(now=wanted.is_large)
-        for unknown in batched(found.unknown):
-            yield from wanted.pause()
-            for cell_id, layer in unknown:
-                answer.failed.append(FailedCell(cell_id, layer, "unknown_cell", "the map has no such cell"))
-        for cells in batched(found.cells):
-            yield from wanted.pause()
-            for index, layer in cells:
-                resident = warm[layer].get(index) if layer in warm else None
-                resident = resident or cache.find_warm(index, layer, now_s)
-                if resident is not None and not found.refused:
-                    if not wanted.spare:
-                        resident.last_use_s = now_s  # the other bookkeeping follows when the answer has left
-                    answer.residents.append(resident)
-                    answer.handles.append(resident.handle)
-                elif resident is not None or not (may_wait and self._waits_for(wanted, index, layer, now_s)):
-                    self._answer_cold(wanted, index, layer, answer, now_s)
-            answer.encode()
-        if may_wait and wanted.waits:
+    def _attempt(self, request: CellRequest) -> bool:
+        """Answer a request, or let it wait for loads and pages; return whether it waits."""
+        found, now_s = self._find(request), self._now_s()
+        answer = self._look_up(request, found, now_s)
+        if self._may_wait(request, found, answer, now_s):
+            request.attempts += 1
+            needed = set() if request.is_spare else {self._cache.key(*cell) for cell in found.cells}
+            self._waiting.wait(request, needed, answer.outstanding, found.pages)
             return True
-        failed = yield from self._failed(wanted, answer.failed)
-        yield from wanted.pause(now=wanted.is_large)
-        self._reply(wanted.session, wanted.request, wanted.layers, answer, found, failed)
-        if wanted.began_s:
-            self._statistics.add_duration("wait", int((now_s - wanted.began_s) * 1e9))
-        yield from self._hand_out(wanted.session, answer, wanted.pace, spare=wanted.spare)
-        while found.cells:  # freeing very many takes time, too
-            del found.cells[-NOTED_PER_STEP:]
-            yield from wanted.pace.pause()
+        if any(cell.holders is _UNNAMED for cell in answer.failed):
+            most = self._cache.holders.largest(MAX_HOLDERS)
+            answer.failed = [
+                msgspec.structs.replace(cell, holders=most) if cell.holders is _UNNAMED else cell
+                for cell in answer.failed
+            ]
+        self._reply(request.session, request.message, found, answer)
+        self._hand_out(request.session, answer, spare=request.is_spare)
+        if request in self._waiting:
+            self._statistics.add_duration("wait", int((now_s - request.began_s) * 1e9))
         return False
 
-    def _waits_for(self, wanted: PendingRequest, index: int, layer: str, now_s: float) -> bool:
-        """Whether a cold cell is being loaded, again if its load had ended, so that the request waits."""
-        key, loads = self._cache.key(index, layer), self._scheduler.loads
-        if key in wanted.outstanding:
-            return True
-        if wanted.spare or key in wanted.found.refused or key in loads.failures:
+    def _may_wait(self, request: CellRequest, found: _Found, answer: _Answer, now_s: float) -> bool:
+        """Whether a request has something to wait for, and may."""
+        if now_s >= request.deadline_s or request.attempts >= (1 if request.is_spare else MAX_ATTEMPTS):
             return False
-        if not self._scheduler.want(index, layer, 0.0, now_s, wanted.session.asker):
-            return False
-        self._waiting.wait_for(wanted, key)
-        return True
+        request.weigh(len(found.cells))
+        if found.pages:
+            return self._waiting.has_room(request)
+        return bool(answer.outstanding) and not found.next_id and self._waiting.has_room(request)
 
-    def _answer_cold(
-        self, wanted: PendingRequest, index: int, layer: str, answer: _Answer, now_s: float
+    def _look_up(self, request: CellRequest, found: _Found, now_s: float) -> _Answer:
+        """Find the segments of cells, and request loads of cold ones; cut the cells if these are many."""
+        cache, warm = self._cache, self._cache.warm.layers
+        cells, cold = found.cells, list[tuple[int, str]]()
+        residents: list[Resident | None] = []
+        for place, (index, layer) in enumerate(cells):
+            resident = warm[layer].get(index) if layer in warm else None
+            resident = resident or cache.find_warm(index, layer, now_s)
+            if resident is None:
+                if len(cold) == MAX_COLD:
+                    self._cut(found, place)
+                    break
+                cold.append((index, layer))
+            residents.append(resident)
+        del residents[len(cells) :]
+        del cold[residents.count(None) :]
+        if cold:
+            keys = (cache.key(*cell) for cell in cold)
+            limits.check_queue(self._scheduler.loads, request.session.asker, keys)
+        if not request.attempts:
+            self._check_quota(request, cells, residents, now_s)
+            if not request.is_spare:
+                self._statistics.add("hits", len(cells) - len(cold))
+                self._statistics.add("misses", len(cold))
+        answer = _Answer()
+        answer.failed = [
+            FailedCell(cell_id, layer, "unknown_cell", "the map has no such cell")
+            for cell_id, layer in found.unknown
+        ]
+        distances = self._distances_m(request, cells) if cold else [0.0] * len(cells)
+        for cell, resident, distance in zip(cells, residents, distances, strict=True):
+            if resident is not None and not request.refused:
+                answer.add(resident)
+            else:
+                self._look_up_cold(request, found, answer, cell, resident, distance, now_s)
+        return answer
+
+    def _check_quota(
+        self,
+        request: CellRequest,
+        cells: Sequence[tuple[int, str]],
+        residents: Sequence[Resident | None],
+        now_s: float,
     ) -> None:
-        """Add a cell that is not warm to the answer: as resident, pending or failed."""
-        cache, found, loads = self._cache, wanted.found, self._scheduler.loads
-        key, catalogue = cache.key(index, layer), cache.catalogue
+        """Refuse the cells that exceed the session's quota; what is refused stays so until the answer."""
+        sizes = [
+            self._cache.estimate(*cell) if resident is None else resident.nbytes
+            for cell, resident in zip(cells, residents, strict=True)
+        ]
+        refused = self._quota.refused(
+            request.session, cells, sizes, lambda some: self._distances_m(request, some)
+        )
+        for key in refused - request.refused:
+            self._cache.events.refused_by_quota(key, now_s)
+        request.refused = refused
+
+    def _cut(self, found: _Found, place: int) -> None:
+        """Leave the cells from a place on, with all layers of the cell there, to the next request."""
+        cells = found.cells
+        while cells[place - 1][0] == cells[place][0]:
+            place -= 1
+        found.next_id = self._wire_id(cells[place - 1][0])
+        del cells[place:]
+
+    def _look_up_cold(
+        self,
+        request: CellRequest,
+        found: _Found,
+        answer: _Answer,
+        cell: tuple[int, str],
+        resident: Resident | None,
+        distance: float,
+        now_s: float,
+    ) -> None:
+        """Add a cell that is not warm, or may be refused, to the answer: as resident, pending or failed."""
+        cache, loads = self._cache, self._scheduler.loads
+        key, layer = cache.key(*cell), cell[1]
         wire_id = cache.wire_id(key.cell_id)
-        failure, promised = loads.failures.get(key), loads.is_promised(key)
-        refused = key in found.refused
-        resident = cache.resident(key)
-        current = resident is not None and cache.is_current(resident)
-        if resident is not None and not refused and (current or key not in found.held_old):
-            answer.residents.append(resident)
-            answer.handles.append(resident.handle if current else resident.stale_handle)
-        if refused:
-            mine = wanted.session.as_holder(wanted.session.held_bytes, len(wanted.session.held))
-            holders, box = (mine,) if mine.bytes else (), catalogue.box(index)
+        if key in request.refused:
+            session = request.session
+            mine = session.as_holder(session.held_bytes, len(session.held))
+            holders, box = (mine,) if mine.bytes else (), cache.catalogue.box(cell[0])
             answer.failed.append(FailedCell(wire_id, layer, "over_budget", self._quota.message, holders, box))
-        elif not current and failure is not None and not promised:
+            return
+        resident = resident or cache.resident(key)
+        if resident is not None and cache.is_current(resident):
+            answer.add(resident)
+            return
+        is_held = key in found.held_old or (resident and is_among(resident.version, found.held))
+        if resident is not None and not is_held:
+            answer.add(resident, stale=True)
+        if self._want(request, cell, key, distance, now_s):
+            answer.outstanding.add(key)
+        failure = loads.failures.get(key)
+        if failure is not None and not loads.is_promised(key):
             holders = _UNNAMED if failure.code in SPACE_CODES else ()
-            box = catalogue.box(index)
+            box = cache.catalogue.box(cell[0])
             answer.failed.append(FailedCell(wire_id, layer, failure.code, failure.message, holders, box))
-        elif not current:
-            if not promised and not wanted.spare:  # evicted, or no longer out of room: a load is promised
-                self._scheduler.want(index, layer, PROMISED, now_s, wanted.session.asker)
+        else:
             answer.pending.append(PendingCell(wire_id, layer))
 
-    def _failed(self, wanted: PendingRequest, failed: list[FailedCell]) -> Generator[None, None, PackedArray]:
-        """Encode the failed cells; name the holders of memory beside cells that do not fit in memory."""
-        packed, most = PackedArray(), tuple[Holder, ...]()
-        if any(cell.holders is _UNNAMED for cell in failed):
-            holders: list[Holder] = []
-            for _ in self._holders.look(holders):
-                yield from wanted.pause()
-            most = tuple(islice(holders, MAX_HOLDERS))
-        for cells in batched(failed):
-            yield from wanted.pause()
-            packed.add(
-                [
-                    msgspec.structs.replace(cell, holders=most) if cell.holders is _UNNAMED else cell
-                    for cell in cells
-                ]
-            )
-        return packed
+    def _want(
+        self, request: CellRequest, cell: tuple[int, str], key: Key, distance: float, now_s: float
+    ) -> Load | None:
+        """Request the load of a cold cell, unless it failed while the request waited for it."""
+        loads, asker = self._scheduler.loads, request.session.asker
+        if request.is_spare:
+            may_begin = not request.attempts
+            return self._scheduler.want_spare(*cell, now_s, asker) if may_begin else None
+        if request.attempts and key in loads.failures and key not in loads.by_key:
+            return None
+        if not request.attempts:
+            self._scheduler.prefetcher.note_cold(request.session, key)
+        return self._scheduler.want(*cell, distance, now_s, asker)
 
-    def _reply(
-        self,
-        session: Session,
-        request: int,
-        layers: tuple[str, ...],
-        answer: _Answer,
-        found: Found,
-        failed: PackedArray | None = None,
-    ) -> None:
+    def _reply(self, session: Session, message: Message, found: _Found, answer: _Answer) -> None:
         """Send a reply; `_hand_out` does the bookkeeping afterwards."""
-        cache = self._cache
-        map_version = cache.catalogue.map_version
-        answer.encode()
+        cache, is_last = self._cache, not found.next_id
         reply = encode_cells(
-            request, cache.epoch, map_version, answer.encoded_handles, found.removed, found.removed_packed,
-            layers, found.covered, answer.encoded_pending, failed or PackedArray(), reason=found.reason,
+            message.request, cache.epoch, cache.catalogue.map_version, answer.handles,
+            found.removed if is_last else (), found.removed_packed if is_last else b"",
+            limits.layers_named(message.layers), covered=found.covered, pending=answer.pending,
+            failed=answer.failed, reason=found.reason, next_id=found.next_id,
         )  # fmt: skip
         session.connection.reply(reply)
 
-    def _hand_out(
-        self, session: Session, answer: _Answer, pace: Pace, *, spare: bool = False
-    ) -> Iterator[None]:
-        """Note what a session was given; the first cells at once, before the client can have left."""
-        residents = answer.residents
-        self._statistics.add("handles_sent", len(residents))
-        for begin in range(0, len(residents), NOTED_PER_STEP):
-            some = residents[begin : begin + NOTED_PER_STEP]
-            if not spare:
-                self._cache.hand_out(some, self._now_s())
-            session.hold(some)
-            yield from pace.pause()
-            if not session.is_connected:
-                return
-        if len(residents) > LARGE:  # freeing these lists takes time, too
-            yield
+    def _hand_out(self, session: Session, answer: _Answer, *, spare: bool = False) -> None:
+        """Note what a session was given."""
+        self._statistics.add("handles_sent", len(answer.residents))
+        if not spare:
+            self._cache.hand_out(answer.residents, self._now_s())
+        session.hold(answer.residents)
 
     # --- what happens meanwhile -----------------------------------------------------------------
 
+    def _answer_in_turn(self, request: CellRequest) -> Iterator[None]:
+        """Try again to answer a waiting request, in one turn of its process."""
+        if request not in self._waiting:  # its session has ended
+            return
+        request.is_due = False
+        waits = False
+        try:
+            waits = self._attempt(request)
+        except ShmmapError as error:
+            request.session.connection.refuse(request.message.request, error)
+        finally:
+            if not waits:
+                self._drop(request)
+        yield from ()
+
     def pages_finished(self, news: PageNews) -> None:
         """Handle pages of the map that have arrived, or cannot be fetched at present."""
-        for page in news.come:
+        for page in (*news.come, *news.out_of_reach):
             self._waiting.page_finished(page)
-        for page in news.out_of_reach:
-            self._waiting.page_finished(page, "offline")
 
     def map_changed(self) -> None:
         """Handle a new state of the map, whose pages differ."""
         self._waiting.map_changed()
 
     def uses(self, page: int) -> bool:
-        """Whether an unanswered request uses a page, or may use it: by its cells or by its area."""
-        pages = self._cache.pages
-        if pages is None or sum(len(wanted.found.cells) for wanted in self._open) > MAX_LOOKED_AT:
+        """Whether a waiting request uses a page, or may use it: by its area, or by its loads."""
+        if len(self._waiting) > MAX_LOOKED_AT:
             return True
-        cells = pages.cells(page)
         return any(
-            any(index in cells for index, _layer in wanted.found.cells)
-            or (wanted.area is not None and page in self._cache.pages_around(wanted.area, wanted.layers))
-            for wanted in self._open
+            request.area is not None and page in self._cache.pages_around(request.area, request.layers)
+            for request in self._waiting
         )
 
-    def next_deadline_s(self) -> float:
+    def next_s(self) -> float:
         """Return the time of the next work: now, or when a client's timeout expires; else infinity."""
-        return self._waiting.next_deadline_s()
+        return 0.0 if self._leftovers else self._waiting.next_s()
 
-    def answer_finished(self) -> None:
-        """Answer requests whose last load or page has arrived; do some of the deferred work."""
-        for wanted in self._waiting.tidy():
-            self._answer_in_turn(wanted)
+    def answer_due(self, now_s: float) -> None:
+        """Queue answers to requests that have nothing left to wait for, or no time; do some deferred work."""
+        for request in self._waiting.take(now_s):
+            self._due(request.session.connection, self._answer_in_turn(request))
+        for _ in Walk(self._deferred()).for_a_turn():
+            pass
 
-    def answer_overdue(self, now_s: float) -> None:
-        """Answer requests whose timeout has expired."""
-        self.answer_finished()
-        for wanted in self._waiting.overdue(now_s):
-            self._answer_in_turn(wanted)
+    def _deferred(self) -> Iterator[None]:
+        while self._leftovers:
+            yield from self._leftovers[0]
+            self._leftovers.popleft()
 
     def on_disconnect(self, session: Session) -> None:
         """Drop the requests of a session whose connection has ended."""
-        for wanted in self._waiting.of(session):
-            self._drop(wanted)
+        dropped = self._waiting.of(session)
+        for request in dropped:
+            self._waiting.remove(request)
+        if dropped:
+            self._leftovers.append(map(self._waiting.release, dropped))
 
     def cancel(self, session: Session, request: int) -> None:
         """Drop a waiting request of a session, by its id, without an answer."""
-        for wanted in self._waiting.of(session):
-            if wanted.request == request:
-                self._drop(wanted)
+        for waiting in self._waiting.of(session):
+            if waiting.message.request == request:
+                self._drop(waiting)
 
-    def _drop(self, wanted: PendingRequest) -> None:
-        self._waiting.remove(wanted)
-        self._end(wanted)
+    def _drop(self, request: CellRequest) -> None:
+        if request in self._waiting:
+            self._waiting.remove(request)
+            self._waiting.release(request)
 
     def on_session_end(self, session: Session) -> None:
         """Release the segments of a session that has ended."""
 
-        def steps() -> Iterator[None]:
-            for resident in session.residents():
-                session.drop_segment(resident)
-                self.release((resident,))
-                yield
+        def release(resident: Resident) -> None:
+            session.drop_segment(resident)
+            self.release((resident,))
 
         self.on_disconnect(session)
-        self._waiting.do_later(steps())
+        self._leftovers.append(map(release, session.residents()))
 
     def answer_all(self) -> None:
         """Answer all requests now: the daemon stops."""
-        for wanted in self._waiting:
-            wanted.deadline_s = 0.0
-            for _ in self._answer_now(wanted):
+        for request in self._waiting:
+            request.deadline_s = 0.0
+            for _ in self._answer_in_turn(request):
                 pass
-
-
-def _check_wait(wait_s: float | None) -> None:
-    if wait_s is not None and not 0 <= wait_s <= MAX_WAIT_S:
-        raise BadRequest(f"wait must be between 0 and {MAX_WAIT_S:.0f} seconds, not {wait_s!r}")
 
 
 def _note_area(session: Session, area: Area, layers: tuple[str, ...]) -> None:

@@ -3,25 +3,26 @@
 
 A version identifies a layer of a cell *and* its state, so a client that holds exactly the current versions
 of an area lacks nothing.  Nearly every request of a moving vehicle is answered by `warm_difference`, which
-is kept short.  `difference` covers all cases, in as many turns as it needs.
+is kept short.  `difference` covers all cases, with arrays: a client may hold many thousands of cells.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator, Sequence
-from dataclasses import dataclass
-from typing import cast
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Final, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.daemon.cache.cell_cache import CellCache
-from shmmap.daemon.records import Resident
-from shmmap.daemon.requests.pending_request import LARGE, PendingRequest
-from shmmap.daemon.turns import BATCH, batched
+from shmmap.daemon.records import Key, Resident
 from shmmap.layers.spec import canonical_layers
 from shmmap.protocol.codec import check_packed, pack_versions, unpack_versions
 from shmmap.protocol.messages import Differential, HeldCell
+
+MAX_WARM_HELD: Final = 1024
+"""Versions held that `warm_difference` compares; with more, arrays are faster than sets."""
 
 
 @dataclass(eq=False, slots=True)
@@ -38,10 +39,10 @@ def warm_difference(
 ) -> WarmDifference | None:
     """Return the difference if the request names versions only and all cells of the area are warm, else None.
 
-    ``found`` are the catalogue indices of the area's cells, ascending.  With very many held cells the answer
-    would take more than a turn, so it is None, too.
+    ``found`` are the catalogue indices of the area's cells, ascending.  With very many held cells it is None,
+    too.
     """
-    if len(message.packed) > 8 * LARGE or len(message.held) > LARGE:
+    if len(message.packed) > 8 * MAX_WARM_HELD or len(message.held) > MAX_WARM_HELD:
         return None
     index = cache.warm
     versions = index.versions(layer, found)
@@ -91,102 +92,145 @@ def _removed_names(
     return tuple(removed)
 
 
+@dataclass(eq=False, slots=True)
+class Difference:
+    """The difference for some of an area's cells; what it does not name, the client holds.
+
+    Attributes
+    ----------
+    cells
+        Catalogue indices and layers that the client lacks, in the area's order.
+    looked_at
+        Number of cells that were compared: the area's first ones from where the request begins.
+    removed, removed_packed
+        What the client should drop, as the reply encodes it.
+    held
+        Versions that the client holds, ascending.
+    held_old
+        Layers of cells that the client holds in an outdated version, as far as they are known.
+    """
+
+    cells: list[tuple[int, str]]
+    looked_at: int
+    held: NDArray[np.uint64]
+    removed: tuple[str, ...] = ()
+    removed_packed: bytes = b""
+    held_old: set[Key] = field(default_factory=set)
+
+
 def difference(
-    wanted: PendingRequest, message: Differential, indices: list[int], layers: tuple[str, ...]
-) -> Generator[None, None, None]:
-    """Find which of the area's cells ``indices`` the client lacks, whether they are in memory or not.
+    cache: CellCache,
+    message: Differential,
+    area: NDArray[np.intp],
+    layers: Sequence[str],
+    *,
+    start: int = 0,
+    most: int = 1 << 62,
+    covered: bool = True,
+) -> Difference:
+    """Find which cells of an area the client lacks, whether they are in memory or not.
 
-    If they are not all the cells of the area, a held cell that is not known may lie in it, and stays.
+    What it should drop is found with the last cell of the area.
 
-    Raises
-    ------
-    MapChanged, NoSession
-        See `PendingRequest.pause`.
+    Parameters
+    ----------
+    area
+        Catalogue indices of the area's cells.
+    start
+        Place in ``area`` to begin at.
+    most
+        Number of layers of cells after which the search ends, with the cell's other layers.
+    covered
+        Whether ``area`` has all cells of the area.  If not, a held cell that is not known may lie in it, and
+        stays.
     """
-    cache, found = wanted.cache, wanted.found
-    versions, of_version = cache.layers, cache.warm.of_version
-    version_of = versions.version
-    current = np.zeros(len(indices) * len(layers), np.uint64)
-    cells = [(index, layer) for index in indices for layer in layers]
-    yield from wanted.pause(now=len(indices) > LARGE)
-    for some in batched(indices):
-        yield from wanted.pause()
-        for unknown in versions.unknown(some, layers):
-            yield from wanted.pause()
-            version_of(*unknown)
-    for first in range(0, len(cells), BATCH):
-        yield from wanted.pause()
-        current[first : first + BATCH] = [version_of(*cell) for cell in cells[first : first + BATCH]]
-    inside = set(indices)
-    has = yield from _held_layers(wanted, message.held, inside, layers)
-    yield from wanted.pause(now=len(cells) > LARGE)
-    order = np.argsort(current)
-    ordered, is_held = current[order], np.zeros(len(cells), np.bool_)
-    removed_packed = []
-    for part in _parts(message.packed):
-        yield from wanted.pause(now=len(part) > LARGE)
-        at = np.searchsorted(ordered, part)
-        known = at < len(ordered)
-        known[known] = ordered[at[known]] == part[known]
-        is_held[order[at[known]]] = True
-        gone: list[int] = []
-        for some_gone in batched(part[~known].tolist()):
-            yield from wanted.pause()
-            for version in some_gone:
-                key = of_version.get(version)
-                cell = cache.index_of(key.cell_id) if key is not None else None
-                if key is not None and cell in inside:
-                    found.held_old.add(key)
-                elif cell is not None or found.covered:
-                    gone.append(version)
-        removed_packed.append(pack_versions(gone))
-    found.removed_packed = b"".join(removed_packed)
-    lacked = np.flatnonzero(~is_held).tolist()
-    for places in batched(lacked):
-        yield from wanted.pause()
-        for place in places:
-            index, layer = cells[place]
-            if layer not in has.get(index, ()):
-                found.cells.append((index, layer))
+    check_packed(message.packed)
+    held = np.unique(np.frombuffer(message.packed, "<u8"))
+    enough = most + len(held) + len(message.held)  # cells of which ``most`` are lacked
+    current, looked_at, _ = cache.layers.of_cells(area[start : start + enough], layers)
+    has = _among(current[:looked_at], held)
+    found = Difference([], looked_at, held)
+    if message.held:
+        places = {index: place - start for place, index in enumerate(area.tolist())}
+        _mark_named(cache, message.held, places, layers, covered, current[:looked_at], has, found)
+    lacked = np.flatnonzero(~has)
+    if len(lacked) > most:
+        found.looked_at = int(lacked[most - 1]) // len(layers) + 1
+        lacked = lacked[lacked < found.looked_at * len(layers)]
+    cells = area[start : start + found.looked_at].tolist()
+    of_cells = (divmod(place, len(layers)) for place in lacked.tolist())
+    found.cells = [(cells[row], layers[column]) for row, column in of_cells]
+    if len(held) and start + found.looked_at == len(area):
+        _mark_gone(cache, area, layers, covered, found)
+    return found
 
 
-def _parts(packed: bytes) -> Iterator[NDArray[np.uint64]]:
-    """Yield the distinct versions that a client holds, in parts that take a fraction of a millisecond each.
-
-    Versions are hashes, so the parts by their first four bits are of about the same size.
-    """
-    check_packed(packed)
-    versions = np.frombuffer(packed, "<u8")
-    if len(versions) <= LARGE:
-        yield np.unique(versions)
-        return
-    for first_bits in range(16):
-        yield np.unique(versions[versions >> np.uint64(60) == first_bits])
-
-
-def _held_layers(
-    wanted: PendingRequest, held: Sequence[HeldCell], inside: set[int], layers: tuple[str, ...]
-) -> Generator[None, None, dict[int, set[str]]]:
-    """Return the layers that the client holds, by cell; note its outdated layers, and what it should drop."""
-    cache, found = wanted.cache, wanted.found
-    version_of = cache.layers.version
-    has: dict[int, set[str]] = {}
+def _mark_named(
+    cache: CellCache,
+    held: Sequence[HeldCell],
+    places: dict[int, int],
+    layers: Sequence[str],
+    covered: bool,
+    current: NDArray[np.uint64],
+    has: NDArray[np.bool_],
+    found: Difference,
+) -> None:
+    """Mark the layers that the client names as held; note its outdated layers, and what it should drop."""
+    columns, versions = {layer: column for column, layer in enumerate(layers)}, current.tolist()
     removed: dict[str, None] = {}
-    for some in batched(held):
-        yield from wanted.pause()
-        for cell in some:
-            index = cache.index_of(cell.id)
-            if index is None or index not in inside:
-                if found.covered or index is not None:
-                    removed[cell.id] = None
-                continue
-            named = layers if cell.layers is None else canonical_layers(cell.layers)
-            mine = [layer for layer in named if layer in layers]
-            if cell.version is not None:  # the current version of one of these layers, or an outdated one
-                current_of = [layer for layer in mine if cell.version == version_of(index, layer)]
-                if not current_of:
-                    found.held_old.update(cache.key(index, layer) for layer in mine)
-                mine = current_of
-            has.setdefault(index, set()).update(mine)
+    marked: list[tuple[int, int]] = []
+    for cell in held:
+        index = cache.index_of(cell.id)
+        place = places.get(index) if index is not None else None
+        if place is None:
+            if covered or index is not None:
+                removed[cell.id] = None
+            continue
+        if not 0 <= place < len(versions):
+            continue
+        named = layers if cell.layers is None else canonical_layers(cell.layers)
+        mine = [columns[layer] for layer in named if layer in columns]
+        if cell.version is not None:  # the current version of one of these layers, or an outdated one
+            current_of = [column for column in mine if cell.version == versions[place][column]]
+            if not current_of and index is not None:
+                found.held_old.update(cache.key(index, layers[column]) for column in mine)
+            mine = current_of
+        marked += [(place, column) for column in mine]
+    if marked:
+        has[tuple(np.array(marked).T)] = True
     found.removed = tuple(removed)
-    return has
+
+
+def _mark_gone(
+    cache: CellCache,
+    area: NDArray[np.intp],
+    layers: Sequence[str],
+    covered: bool,
+    found: Difference,
+) -> None:
+    """Note the versions that are not current in the area: outdated ones of its cells, and those to drop."""
+    current, _, complete = cache.layers.of_cells(area, layers)
+    catalogue, of_version = cache.catalogue, cache.warm.of_version
+    others = found.held[~_among(found.held, np.sort(current, axis=None))].tolist()
+    inside = set(map(catalogue.id, area.tolist())) if others else ()
+    gone: list[int] = []
+    for version in others:
+        key = of_version.get(version)
+        if key is not None and key.cell_id in inside:
+            found.held_old.add(key)
+        elif (covered and complete) or (key is not None and catalogue.find(key.cell_id) is not None):
+            gone.append(version)  # else it may be current somewhere in the area
+    found.removed_packed = pack_versions(gone)
+
+
+def is_among(version: int, ordered: NDArray[np.uint64]) -> bool:
+    """Whether a version is among others, which are in ascending order."""
+    return bool(_among(np.array([version], np.uint64), ordered)[0])
+
+
+def _among(values: NDArray[np.uint64], ordered: NDArray[np.uint64]) -> NDArray[np.bool_]:
+    """Return which values are among others, which are in ascending order."""
+    if not len(ordered):
+        return np.zeros(values.shape, np.bool_)
+    found: NDArray[np.bool_] = ordered[np.searchsorted(ordered, values) % len(ordered)] == values
+    return found

@@ -28,7 +28,7 @@ from shmmap.daemon.telemetry.sampler import Sampler
 from shmmap.daemon.transport.connection import Connection
 from shmmap.daemon.transport.inbox import WorkItem
 from shmmap.daemon.transport.sessions import Session
-from shmmap.daemon.turns import Pace, batched
+from shmmap.daemon.turns import Pace
 from shmmap.errors import BadRequest, InternalError, NoSession, ShmmapError
 from shmmap.logfmt import log
 from shmmap.protocol import messages
@@ -129,11 +129,8 @@ class Dispatch:
             if message.intent is not None:
                 check_intent(message.intent)
                 session.state_intent(message.intent)
-            if isinstance(message, messages.Differential):
-                return self.cells.differential(session, message)
-            if isinstance(message, messages.Area):
-                return self.cells.area(session, message)
-            return self.cells.selected(session, message)
+            self.cells.serve(session, message)
+            return None
         if isinstance(message, messages.Release):
             return self._release(session, message)
         if isinstance(message, OPERATOR_REQUESTS):
@@ -159,9 +156,9 @@ class Dispatch:
     def _release(self, session: Session, message: messages.Release) -> Iterator[None]:
         versions = list(session.held) if message.packed is None else unpack_versions(message.packed)
         pace = Pace()
-        for some in batched(versions):
+        for version in versions:
             yield from pace.pause()
-            self.cells.release(session.drop(some))
+            self.cells.release(session.drop((version,)))
         session.connection.reply(encode(messages.Released(message.request)))
 
     def _answer_stats(self, session: Session, message: messages.Stats, usage: Usage) -> Iterator[None]:

@@ -61,11 +61,13 @@ class Handshake:
             There are too many sessions.
         """
         if message.major != PROTOCOL_VERSION[0]:
-            older = "client" if message.major < PROTOCOL_VERSION[0] else "daemon"
+            hint = "update the client, and restart it; until then it keeps the cells that it has mapped"
+            if message.major > PROTOCOL_VERSION[0]:
+                hint = "update the daemon, and restart it"
             raise ProtocolMismatch(
                 f"client speaks protocol {message.major}.{message.minor},"
                 f" daemon {PROTOCOL_VERSION[0]}.{PROTOCOL_VERSION[1]}",
-                hint=f"update the {older}, and restart it",
+                hint=hint,
             )
         if (session := self.sessions.by_slot(connection.slot)) is not None:
             return session  # a repeated hello: its answer was late or lost

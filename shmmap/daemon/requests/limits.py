@@ -4,11 +4,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import chain
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 
@@ -16,23 +16,23 @@ from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.eviction_plan import HAND_OUT_GRACE_S
 from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.records import Key, Resident
-from shmmap.daemon.requests.pending_request import PendingRequest
 from shmmap.daemon.transport.sessions import Session
-from shmmap.daemon.turns import batched
 from shmmap.errors import BadRequest, Busy
 from shmmap.layers.spec import canonical_layer, canonical_layers
 from shmmap.protocol import messages
 from shmmap.quantities import format_bytes
 
 MAX_CELLS: Final = 20_000
-"""Cells of one request, over all its layers."""
+"""Cells of one area, over all its layers."""
 MAX_QUEUED: Final = 20_000
 """A process with this many queued loads may add none; each takes 2 kB of the daemon's memory."""
-MAX_HELD: Final = 100_000
+MAX_HELD: Final = 20_000
 MAX_LAYERS_HELD: Final = 64
 """Distinct layers among the cells that a client says it holds; parsing a layer's name takes some 40 us."""
 MAX_LAYERS: Final = 16
 """Layers of one request."""
+
+Distances: TypeAlias = Callable[[Sequence[tuple[int, str]]], Sequence[float]]
 
 
 def check_count(count: int) -> None:
@@ -47,6 +47,21 @@ def check_count(count: int) -> None:
         raise BadRequest(
             f"more than {MAX_CELLS} cells in one request",
             hint="ask for a smaller area, or for some ids at a time",
+        )
+
+
+def check_selected(message: messages.Selected, layers: Sequence[str]) -> None:
+    """Refuse a request for more than `MAX_SELECTED` cells by id, counting each layer of a cell.
+
+    Raises
+    ------
+    BadRequest
+        The request names more.
+    """
+    if len(message.ids) * len(layers) > messages.MAX_SELECTED:
+        raise BadRequest(
+            f"more than {messages.MAX_SELECTED} cells selected in one request",
+            hint="ask for some ids at a time",
         )
 
 
@@ -68,22 +83,16 @@ def check_held(message: messages.Differential) -> None:
         raise BadRequest(f"{len(layers)} layers held; {MAX_LAYERS_HELD} is the most one request may name")
 
 
-def check_queue(loads: Loads, wanted: PendingRequest, cold: Sequence[tuple[int, str]]) -> Iterator[None]:
+def check_queue(loads: Loads, asker: Hashable, cold: Iterable[Key]) -> None:
     """Refuse to queue loads of the ``cold`` cells for a process that already waits for too many.
 
     Raises
     ------
     Busy
         The process waits for `MAX_QUEUED` loads, and not all the cold cells are among them.
-    MapChanged, NoSession
-        See `PendingRequest.pause`.
     """
-    if loads.queued_of(wanted.session.asker) < MAX_QUEUED:
-        return
-    for cells in batched(cold):
-        yield from wanted.pause()
-        if any(wanted.cache.key(index, layer) not in loads.by_key for index, layer in cells):
-            raise Busy(f"{MAX_QUEUED} loads of this process wait already", hint="wait for some of them")
+    if loads.queued_of(asker) >= MAX_QUEUED and not all(key in loads.by_key for key in cold):
+        raise Busy(f"{MAX_QUEUED} loads of this process wait already", hint="wait for some of them")
 
 
 @lru_cache(maxsize=128)  # requests have few specs, and repeat them
@@ -144,60 +153,54 @@ class SessionQuota:
         """Whether these segments certainly fit in the session's quota."""
         return session.held_bytes + sum(resident.nbytes for resident in residents) <= self.nbytes
 
-    def check(self, wanted: PendingRequest, sizes: Sequence[int]) -> Iterator[None]:
-        """Mark the cells that exceed the quota as refused, farthest cells first.
+    def refused(
+        self, session: Session, cells: Sequence[tuple[int, str]], sizes: Sequence[int], distances: Distances
+    ) -> set[Key]:
+        """Return the cells that exceed the quota, farthest cells first.
 
         Parameters
         ----------
         sizes
             Bytes of each requested cell.
-
-        Raises
-        ------
-        MapChanged, NoSession
-            See `PendingRequest.pause`.
+        distances
+            Returns their distances from the client.
         """
-        session, survey, events = wanted.session, self.cache.survey, self.cache.events
         if session.held_bytes + sum(sizes) <= self.nbytes:
-            return
-        too_much, added, keys = yield from self._excess(wanted, sizes)
-        if too_much:  # look whether the session has released something
-            before_s = self.clock() - HAND_OUT_GRACE_S
-            enough = lambda: session.exclusive_bytes + added <= self.nbytes  # noqa: E731
-            for _ in survey.look_at(session, before_s, enough, keys):
-                yield from wanted.pause()
-            too_much, _, _ = yield from self._excess(wanted, sizes)
-        for refused in batched(too_much):
-            yield from wanted.pause()
-            for key in refused:
-                wanted.found.refused.add(key)
-                events.refused_by_quota(key, self.clock())
+            return set()
+        nearest = np.argsort(distances(cells), kind="stable").tolist()
+        keys = {self.cache.key(*cell) for cell in cells}
+        refused, added = self._excess(session, cells, sizes, nearest)
+        if refused:  # look whether the session has released something
+            self.cache.survey.look_at(
+                session,
+                self.clock() - HAND_OUT_GRACE_S,
+                lambda: session.exclusive_bytes + added <= self.nbytes,
+                keys,
+            )
+            refused, _ = self._excess(session, cells, sizes, nearest)
+        return refused
 
     def _excess(
-        self, wanted: PendingRequest, sizes: Sequence[int]
-    ) -> Generator[None, None, tuple[list[Key], int, set[Key]]]:
-        """Return the keys over quota, the bytes that all keys add to the exclusive memory, and all keys."""
-        session, cells = wanted.session, wanted.found.cells
+        self,
+        session: Session,
+        cells: Sequence[tuple[int, str]],
+        sizes: Sequence[int],
+        nearest: Sequence[int],
+    ) -> tuple[set[Key], int]:
+        """Return the keys over quota, and the bytes that all keys add to the session's exclusive memory."""
         counted: set[Key] = set()
-        too_much: list[Key] = []
+        refused: set[Key] = set()
         added = 0
-        distances: list[float] = []
-        for some in batched(cells):
-            yield from wanted.pause()
-            distances += wanted.distances_m(some)
-        nearest: list[int] = np.argsort(distances, kind="stable").tolist()
-        for positions in batched(nearest):
-            yield from wanted.pause()
-            for position in positions:
-                index, layer = cells[position]
-                key = self.cache.key(index, layer)
-                if key in counted:
-                    continue
-                counted.add(key)
-                resident = self.cache.warm.get(index, layer)
-                if resident is not None and resident.sessions:
-                    continue  # a session holds it already, perhaps this one
-                added += sizes[position] - self.cache.replaced_bytes(session, key)
-                if session.exclusive_bytes + added > self.nbytes:
-                    too_much.append(key)
-        return too_much, added, counted
+        for position in nearest:
+            index, layer = cells[position]
+            key = self.cache.key(index, layer)
+            if key in counted:
+                continue
+            counted.add(key)
+            resident = self.cache.warm.get(index, layer)
+            if resident is not None and resident.sessions:
+                continue  # a session holds it already, perhaps this one
+            added += sizes[position] - self.cache.replaced_bytes(session, key)
+            if session.exclusive_bytes + added > self.nbytes:
+                refused.add(key)
+        return refused, added

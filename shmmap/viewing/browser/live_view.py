@@ -17,9 +17,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.errors import DaemonUnreachable, NoColumn, ProtocolMismatch, ShmmapError
+from shmmap.errors import DaemonUnreachable, NoColumn, ShmmapError
 from shmmap.geometry import Box
-from shmmap.protocol import messages
 from shmmap.viewing.browser.cell_points import Colours, Ground, blocks
 from shmmap.viewing.browser.detail import LEAVES, Changes, Sizes, changes, choose, layer_of
 from shmmap.viewing.browser.page import NO_CLIENT, Page, Place
@@ -34,7 +33,6 @@ if TYPE_CHECKING:
     from shmmap.client.client import Client
     from shmmap.protocol.rows import ClientRow
 
-_SPARE_MINOR: Final = 1  # minor version of the protocol since which there are spare requests
 _STATE_S: Final = 0.1  # how often clients are looked at
 _CHUNKS_S: Final = 1.0
 _PLAN_S: Final = 0.25
@@ -47,22 +45,6 @@ _LITTLE: Final = 8 << 20  # with less free memory, the daemon may have no room f
 _IDLE_S: Final = 0.03
 _AGAIN_S: Final = 0.5  # between two tries to reach the daemon
 _START_M: Final = (120.0, 40.0)  # at first, how far from what one looks at: at most, at least
-
-
-def refuse_older(welcome: messages.Welcome) -> None:
-    """Refuse a daemon that would load for a viewer as for its clients: it knows no spare requests.
-
-    Raises
-    ------
-    ProtocolMismatch
-        It is such a daemon.
-    """
-    if welcome.minor < _SPARE_MINOR:
-        raise ProtocolMismatch(
-            f"the daemon speaks protocol {welcome.major}.{welcome.minor}: to it, a viewer is like any client,"
-            " and would take memory and loads from others",
-            hint="update the daemon, and restart it; `shmmap view --image FILE` draws a picture",
-        )
 
 
 class _Map:
@@ -321,11 +303,7 @@ class LiveView:
     def _ask(self, ids: list[str], layer: str, wait_s: float) -> CellSet:
         """Ask for cells as one who must not be in anyone's way."""
         session = self._client.session
-        refuse_older(self._client.welcome)  # another daemon may have come
-        names = tuple(ids)
-        return session.run(
-            session.cells(lambda n: messages.Selected(n, names, (layer,), wait_s, None, True), wait_s)
-        )
+        return session.run(session.selected(tuple(ids), (layer,), wait_s, spare=True))
 
     def _show(self, page: Page, found: CellSet, level: int, *, is_whole: bool = True) -> set[int]:
         """Put cells on a page; each is unmapped again."""

@@ -89,7 +89,7 @@ while True:
     while client.readable():
         client.receive_bytes()
     with RawClient(path, hello=False) as visitor:
-        visitor.send("hello", 2, 0, "visitor")
+        visitor.send("hello", 3, 0, "visitor")
 """,
 )
 

@@ -141,7 +141,7 @@ def opens_sessions(orders: Orders, endpoint: str) -> int:
         one = context.socket(zmq.DEALER)
         one.linger = 0
         one.connect(f"ipc://{endpoint}")
-        one.send(pack(["hello", 1, 2, 0, "crowd"]))
+        one.send(pack(["hello", 1, 3, 0, "crowd"]))
         held.append(one)
         count += bool(one.poll(1000))
         if len(held) > CROWD:

@@ -270,7 +270,7 @@ for number in range(4200):
     one = context.socket(zmq.DEALER)
     one.linger = 0
     one.connect("ipc://" + path)
-    one.send(pack(["hello", 1, 2, 0, "crowd"]))
+    one.send(pack(["hello", 1, 3, 0, "crowd"]))
     assert one.poll(60000)
     one.close()
 done()
@@ -292,8 +292,8 @@ one.settimeout(20.0)
 def send(message):
     body = pack(message)
     one.sendall(b"\\x02" + struct.pack(">Q", len(body)) + body)
-send(["hello", 1, 2, 0, "deaf"])
-names = ["0_0.pcd"] * 3000
+send(["hello", 1, 3, 0, "deaf"])
+names = ["0_0.pcd"] * 128
 try:
     while True:
         send(["selected", 1, names, ["points"], None])
@@ -334,7 +334,7 @@ def test_a_process_that_asks_too_much_at_once(served: DaemonProcess, client: Raw
     All replies together are fewer, and less, than what the daemon keeps for a client that does not read.
     """
     serves(client)
-    body = [client.send("selected", ["0_0.pcd"] * 500, ["points"], None) for _ in range(200)]
+    body = [client.send("selected", ["0_0.pcd"] * 128, ["points"], None) for _ in range(200)]
     kinds = [client.receive() for _ in body]
     refused = [reply for reply in kinds if reply[0] == "error"]
     assert all(reply[2] == "busy" for reply in refused)

@@ -10,6 +10,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
+import pytest
 import zmq
 
 from tests.process.conftest import DaemonFactory
@@ -18,27 +19,29 @@ from tests.support.divided_map import DividedMap
 from tests.support.message_pack import pack, unpack
 from tests.support.plain_client import PlainClient
 
-HELLO_OF_1_5 = bytes.fromhex("95 a568656c6c6f 07 01 05 a36f6c64")
-"""What a client of 1.5 that is called "old" begins with, as request 7."""
+HELLO = bytes.fromhex("95 a568656c6c6f 07")
+"""What a hello begins with, as request 7; major, minor and the client's name follow."""
 VERBS = (("query", "--circle", "0,0,5"), ("status",), ("ls",))
 """Verbs that ask the daemon, and verbs that read its statistics, where it can be found only by its socket."""
 TIMEOUT_S = 60.0
 
 
-def test_a_client_of_1_x_is_refused_and_stays_connected(
-    daemon: DaemonFactory, divided_map: DividedMap
+@pytest.mark.parametrize(("major", "minor"), [(1, 5), (2, 0), (2, 2)])
+def test_an_older_client_is_refused_and_stays_connected(
+    daemon: DaemonFactory, divided_map: DividedMap, major: int, minor: int
 ) -> None:
     client = PlainClient(daemon(divided_map.root).endpoint)
-    client.send_frame(HELLO_OF_1_5)
-    said = "client speaks protocol 1.5, daemon 2.2"
-    assert client.message() == ["error", 7, "protocol_mismatch", said, "update the client, and restart it"]
+    client.send_frame(HELLO + bytes((major, minor)) + b"\xa3old")
+    said = f"client speaks protocol {major}.{minor}, daemon 3.0"
+    hint = "update the client, and restart it; until then it keeps the cells that it has mapped"
+    assert client.message() == ["error", 7, "protocol_mismatch", said, hint]
     assert client.hello()[0] == "welcome"
     client.close()
 
 
 def test_a_daemon_of_1_x_is_named(shmmap: Verbs, short_path: Path) -> None:
-    """It answers a hello of 2.2 as 1.5 did: an error whose elements have not changed since."""
-    path, said = short_path / "old.sock", "client speaks protocol 2.2, daemon 1.5"
+    """It answers a hello of 3.0 as 1.5 did: an error whose elements have not changed since."""
+    path, said = short_path / "old.sock", "client speaks protocol 3.0, daemon 1.5"
     asked: list[Any] = []
 
     def refuse() -> None:
@@ -68,7 +71,7 @@ def test_a_daemon_of_1_x_is_named(shmmap: Verbs, short_path: Path) -> None:
     finally:
         context.term()
         daemon.join()
-    assert {(tag, *version) for tag, version in asked} == {("hello", 2, 2)}
+    assert {(tag, *version) for tag, version in asked} == {("hello", 3, 0)}
     assert said in stop
     assert f"a signal ends a daemon of any version: kill {os.getpid()}" in stop
     for text in printed:

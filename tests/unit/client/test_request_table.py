@@ -32,7 +32,6 @@ class Driven:
 
     def __init__(self) -> None:
         self.table = RequestTable()
-        self.table.can_cancel = True
         self.now_s = 100.0
         self.answers: SimpleQueue[Outstanding] = SimpleQueue()
 
@@ -155,13 +154,22 @@ def test_more_requests_than_may_wait(one: Driven) -> None:
     assert one.sent() == [], "it has left no place: 64 wait"
     one.now_s += 2.0
     one.table.receive(Cells(7, 1, 2), one.now_s)
-    ((_, number, _, _, wait_s, _),) = one.sent()
+    ((_, number, _, _, wait_s, *_),) = one.sent()
     assert (number, wait_s) == (PLACES, 8.0)
     one.table.withdraw([(8, False)], one.now_s)
     assert one.ids() == [("cancel", 8), ("area", PLACES + 1)]
     one.table.withdraw([(PLACES + 2, False)], one.now_s)
     assert one.sent() == [], "that one was with the daemon no more"
     assert one.answered() == [7]
+
+
+def test_a_reply_that_is_not_the_last_is_not_early(one: Driven) -> None:
+    """It waits for no loads: its client goes on at once."""
+    one.ask(1, wait_s=20.0)
+    one.ask(2, wait_s=5.0)
+    one.sent()
+    one.table.receive(Cells(2, 1, 2, pending=(PendingCell("a", "points"),), next="a"), one.now_s)
+    assert one.answered() == [2]
 
 
 def test_one_that_is_held_until_its_wait_is_over(one: Driven) -> None:
@@ -173,7 +181,7 @@ def test_one_that_is_held_until_its_wait_is_over(one: Driven) -> None:
     one.tick(4.0)
     assert one.sent() == []
     one.tick(1.1)
-    ((_, number, _, _, wait_s, _),) = one.sent()
+    ((_, number, _, _, wait_s, *_),) = one.sent()
     assert (number, wait_s) == (2, None)
     one.early(2)
     assert one.answered() == [2]
@@ -238,22 +246,13 @@ def not_waiting(one: Driven) -> None:
     assert one.sent() == []
 
 
-def old_daemon(one: Driven) -> None:
-    """It would not understand."""
-    one.table.can_cancel = False
-    one.ask(1, wait_s=5.0)
-    one.sent()
-    one.table.withdraw([(1, False)], one.now_s)
-    assert one.sent() == []
-
-
 def unknown(one: Driven) -> None:
     """One that its caller has sent by itself."""
     one.table.withdraw([(1, True)], one.now_s)
     assert one.ids() == [("cancel", 1)]
 
 
-@pytest.mark.parametrize("act", [unsent, not_waiting, old_daemon, unknown])
+@pytest.mark.parametrize("act", [unsent, not_waiting, unknown])
 def test_withdrawn(one: Driven, act: Callable[[Driven], None]) -> None:
     act(one)
     assert one.answered() == []

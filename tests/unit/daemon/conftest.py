@@ -25,7 +25,6 @@ def small_map(tmp_path: Path) -> DividedMap:
 def short_turns(monkeypatch: pytest.MonkeyPatch) -> None:
     """End each turn of work on many things after the first of them."""
     monkeypatch.setattr("shmmap.daemon.turns.TURN_S", 0.0)
-    monkeypatch.setattr("shmmap.daemon.turns.BATCH", 1)
 
 
 @pytest.fixture

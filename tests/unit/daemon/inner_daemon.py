@@ -17,6 +17,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.loading.link import Link
 from shmmap.daemon.loading.worker_messages import Job
@@ -53,6 +55,17 @@ EVERYWHERE = BoxMessage(-1e4, -1e4, 1e4, 1e4)
 def names(reply: Cells) -> list[str]:
     """File names of the cells that a reply has, in its order."""
     return [Path(cell.id).name for cell in reply.cells]
+
+
+def joined(parts: list[Cells]) -> Cells:
+    """Return the replies to one request as one."""
+    return msgspec.structs.replace(
+        parts[-1],
+        map_version=parts[0].map_version,
+        cells=tuple(cell for part in parts for cell in part.cells),
+        pending=tuple(cell for part in parts for cell in part.pending),
+        failed=tuple(cell for part in parts for cell in part.failed),
+    )
 
 
 def finish(work: Iterator[None] | None) -> None:
@@ -144,8 +157,7 @@ class InnerDaemon:
 
     def ask(self, session: Session, message: Area | Differential | Selected) -> None:
         """Begin to serve a request for cells, and do what of it needs no waiting."""
-        verb = getattr(self.cells, type(message).__name__.lower())
-        finish(verb(session, message))
+        self.cells.serve(session, message)
 
     def now_s(self) -> float:
         """Return the time of the daemon's clock."""
@@ -175,7 +187,7 @@ class InnerDaemon:
         self.scheduler.pump(now_s)
         while self.scheduler.unfinished:
             self.scheduler.pump(now_s)
-        self.cells.answer_overdue(now_s)
+        self.cells.answer_due(now_s)
         self.map_switch.run_step(now_s)
         if self.scheduler.prefetcher.next_s <= now_s:
             self.scheduler.prefetcher.run_step(now_s)
@@ -197,7 +209,7 @@ class InnerDaemon:
 
     def run_until_nothing_waits(self) -> None:
         """Turn until no request waits; nothing may be kept for any."""
-        self.run_until(lambda: self.cells.next_deadline_s() == math.inf)
+        self.run_until(lambda: self.cells.next_s() == math.inf)
         assert (list(self.ledger.needed()), self.waiting._of_load, len(self.cells)) == ([], {}, 0)
 
     def reply_to(self, request: int) -> Any:
@@ -222,9 +234,29 @@ class InnerDaemon:
         self.ask(session or self.session(), message)
         return self.cells_of(message.request)
 
+    def parts_for(self, message: Area | Differential, session: Session | None = None) -> Iterator[Cells]:
+        """Serve a request reply after reply."""
+        session, start = session or self.session(), ""
+        while True:
+            known = len(self.replies)
+            self.ask(session, msgspec.structs.replace(message, start=start))
+            self.run_until(lambda known=known: len(self.replies) > known)  # type: ignore[misc]
+            (part,) = (reply for _, reply in self.replies[known:] if reply.request == message.request)
+            yield part
+            if not (start := part.next):
+                return
+
+    def all_for(self, message: Area | Differential, session: Session | None = None) -> Cells:
+        """Serve a request reply after reply, and anew until nothing is pending; return all cells."""
+        while True:
+            whole = joined(list(self.parts_for(message, session)))
+            if not whole.pending:
+                return whole
+            self.turn()
+
     def everything(self, request: int = 1) -> Cells:
         """Ask for all cells and wait for them."""
-        return self.cells_for(Area(request, EVERYWHERE, wait=600.0))
+        return self.all_for(Area(request, EVERYWHERE, wait=600.0))
 
     def listed(self) -> list[CellRow]:
         """All that is in memory, as clients list it."""

@@ -178,26 +178,6 @@ def test_pages_come_one_after_the_other(in_pages: Callable[..., Paged]) -> None:
     assert (names(reply.cells), reply.covered) == (ALL, True), "in id order, whatever the pages'"
 
 
-def test_a_page_that_comes_while_the_request_begins_is_not_missed(
-    paged: Paged, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Between its look at the pages and its waiting for them others have turns."""
-    cells = paged.daemon.service._loop.cells
-    have_loaded = cells._have_loaded
-
-    def and_it_comes(wanted: Any, *, note: bool) -> Any:
-        paged.pages.come(EAST)
-        paged.paging.collect()
-        return have_loaded(wanted, note=note)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(cells, "_have_loaded", and_it_comes)
-        paged.daemon.send(m.Area(50, EVERYWHERE, wait=LONG_S))
-        paged.daemon.turn_until(lambda: paged.pages.is_here(EAST))
-    reply = paged.answer()
-    assert (names(reply.cells), reply.covered) == (ALL, True)
-
-
 def test_another_state_of_the_map_while_a_request_waits_for_a_page(paged: Paged) -> None:
     paged.begin(lambda n: m.Area(n, EVERYWHERE, wait=LONG_S))
     paged.directory.remove_cell("20_20.pcd")

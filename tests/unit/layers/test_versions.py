@@ -129,7 +129,8 @@ def test_a_state_learnt_in_place_forgets_what_looks_into_it_alone(one: Map) -> N
     index = one.index("20_20.pcd")
     one.catalogue.set_stamp(index, bytes(24))
     one.versions.cell_changed(index)
-    assert len(list(one.versions.unknown(range(16), FAR))) == 4 * len(FAR)
+    known = [np.count_nonzero(one.versions._tables[layer]) for layer in FAR]
+    assert known == [12] * len(FAR)
     after = one.all([*PLAIN, *FAR])
     fresh = LayerVersions(lambda: one.catalogue)
     assert after == {key: fresh.version(one.index(key[0]), key[1]) for key in after}
@@ -145,19 +146,34 @@ def test_dependents_are_the_cells_that_look(one: Map) -> None:
             assert set(cells) == {index} | looking, layer
 
 
-def test_what_is_unknown_is_what_takes_long(one: Map, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert list(one.versions.unknown(range(16), PLAIN)) == []
-    assert len(list(one.versions.unknown(range(16), [*PLAIN, *FAR]))) == 16 * len(FAR)
-    one.versions.version(3, "denoise")
-    assert (3, "denoise") not in list(one.versions.unknown(range(16), ["denoise"]))
+def test_versions_of_many_cells(one: Map, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Some are computed at a time, in order; those that are known are not computed again."""
+    layers = [*PLAIN, *FAR]
+    expected = np.array([[one.versions.version(i, layer) for layer in layers] for i in range(16)], np.uint64)
+    cells = np.array([*range(15, -1, -1)])
+    cost = sum(layer_versions.HALO_COST if layer in FAR else 1 for layer in layers)
+    for at_once in (1, 5, 16, 100):
+        versions = LayerVersions(lambda: one.catalogue)
+        monkeypatch.setattr(layer_versions, "COMPUTED_AT_ONCE", at_once * cost)
+        for known in range(at_once, 16 + at_once, at_once):
+            found, count, complete = versions.of_cells(cells, layers)
+            assert (count, complete) == (min(known, 16), known >= 16)
+            assert found[:count].tolist() == expected[::-1][:count].tolist()
+            assert np.all((found == expected[::-1]) | (found == 0))
+        monkeypatch.setattr(versions, "version", None)
+        assert versions.of_cells(cells, layers)[0].tolist() == expected[::-1].tolist()
+    assert versions.of_cells(cells[:0], layers)[1:] == (0, True)
+
+
+def test_always_new_layers_fill_no_memory(one: Map, monkeypatch: pytest.MonkeyPatch) -> None:
     before = one.all(FAR)
-    monkeypatch.setattr(layer_versions, "MAX_REMEMBERED", 4)
-    for number in range(100):  # requests for always new layers fill no memory
+    monkeypatch.setattr(layer_versions, "TABLES_BYTES", 8 * 16 * 5)
+    for number in range(100):
         one.versions.version(number % 16, f"normals(radius={number % 50 + 1}.0)")
-    assert sum(map(len, one.versions._known.values())) == one.versions._count <= 16 * len(FAR)
+    assert len(one.versions._tables) == 5
     assert one.all(FAR) == before
     one.versions.forget()
-    assert len(list(one.versions.unknown(range(16), FAR))) == 16 * len(FAR)
+    assert one.all(FAR) == before
 
 
 def test_a_layer_that_looks_into_too_many_cells(tmp_path: Path) -> None:

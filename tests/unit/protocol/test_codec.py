@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from shmmap import geometry
 from shmmap.errors import BadRequest, ProtocolMismatch
 from shmmap.protocol.codec import (
-    PackedArray,
     decode_reply,
     decode_request,
     encode,
@@ -196,13 +195,6 @@ holders = st.builds(Holder, numbers, small, st.integers(-1, 1 << 32), texts, sma
 failed_cells = st.builds(FailedCell, texts, texts, texts, texts, st.lists(holders, max_size=3).map(tuple))
 
 
-def encoded(elements: list[bytes]) -> PackedArray:
-    array = PackedArray()
-    array.add_encoded(elements[:5])
-    array.add_encoded(elements[5:])
-    return array
-
-
 @settings(max_examples=200, deadline=None)
 @given(
     st.tuples(numbers, numbers, numbers),
@@ -213,6 +205,7 @@ def encoded(elements: list[bytes]) -> PackedArray:
     st.lists(failed_cells, max_size=20),
     st.lists(texts, max_size=3),
     st.booleans(),
+    texts,
     texts,
 )
 def test_any_content(
@@ -225,6 +218,7 @@ def test_any_content(
     layers: list[str],
     covered: bool,
     reason: str,
+    next_id: str,
 ) -> None:
     whole = Cells(
         *ids,
@@ -236,12 +230,11 @@ def test_any_content(
         tuple(layers),
         covered,
         reason,
+        next_id,
     )
-    halves = PackedArray(failures[:7])
-    halves.add(failures[7:])
     parts = encode_cells(
-        *ids, encoded([encode_handle(h) for h in cells]), tuple(removed), packed,
-        tuple(layers), covered, PackedArray(pending), halves, reason=reason,
+        *ids, [encode_handle(h) for h in cells], tuple(removed), packed, tuple(layers),
+        covered=covered, pending=pending, failed=failures, reason=reason, next_id=next_id,
     )  # fmt: skip
     assert parts == encode(whole)
     assert decode_reply(parts) == whole
@@ -251,24 +244,12 @@ def test_any_content(
 def test_any_number_of_handles(count: int) -> None:
     """The head of a MessagePack array has one byte, three or five."""
     handle = Handle("a.pcd", 1, "points", "0" * 16, 0, 4096, 10, 0.0, 0.0, 20.0, 20.0)
-    parts = encode_cells(1, 2, 3, encoded([encode_handle(handle)] * count), (), b"", ())
+    parts = encode_cells(1, 2, 3, [encode_handle(handle)] * count, (), b"", ())
     assert parts == encode(Cells(1, 2, 3, (handle,) * count))
 
 
 @pytest.mark.parametrize("count", [0, 15, 16, 65535, 65536])
 def test_any_number_of_removed_ids(count: int) -> None:
     removed = ("x",) * count
-    assert encode_cells(1, 2, 3, PackedArray(), removed, b"", ()) == encode(Cells(1, 2, 3, (), removed))
-    assert encode_cells(1, 2, 3, PackedArray(), (), bytes(count), ()) == encode(
-        Cells(1, 2, 3, (), (), bytes(count))
-    )
-
-
-@pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 65535, 65536])
-@pytest.mark.parametrize("at_once", [1, 16, 64])
-def test_an_array_in_parts(count: int, at_once: int) -> None:
-    array = PackedArray()
-    for begin in range(0, count, at_once):
-        array.add([begin] * min(at_once, count - begin))
-    whole = [number // at_once * at_once for number in range(count)]
-    assert b"".join(array.parts()) == encode(whole)
+    assert encode_cells(1, 2, 3, (), removed, b"", ()) == encode(Cells(1, 2, 3, (), removed))
+    assert encode_cells(1, 2, 3, (), (), bytes(count), ()) == encode(Cells(1, 2, 3, (), (), bytes(count)))

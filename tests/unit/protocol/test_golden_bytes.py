@@ -40,6 +40,7 @@ REQUESTS: list[tuple[Any, list[Any], str]] = [
             ("points",),
             0.5,
             m.Intent(1.0, 2.0, 3.0, 4.0, 0.5, ((5.0, 6.0),)),
+            "a.pcd",
         ),
         [
             "area",
@@ -48,12 +49,13 @@ REQUESTS: list[tuple[Any, list[Any], str]] = [
             ["points"],
             0.5,
             [1.0, 2.0, 3.0, 4.0, 0.5, [[5.0, 6.0]]],
+            "a.pcd",
         ],
         (
-            "96a4617265610396a6636972636c65cb3ff0000000000000cbc000000000000000cb4062c0000000"
+            "97a4617265610396a6636972636c65cb3ff0000000000000cbc000000000000000cb4062c0000000"
             "0000cb0000000000000000cb401400000000000091a6706f696e7473cb3fe000000000000096cb3f"
             "f0000000000000cb4000000000000000cb4008000000000000cb4010000000000000cb3fe0000000"
-            "0000009192cb4014000000000000cb4018000000000000"
+            "0000009192cb4014000000000000cb4018000000000000a5612e706364"
         ),
     ),
     (
@@ -63,6 +65,9 @@ REQUESTS: list[tuple[Any, list[Any], str]] = [
             ("points",),
             (m.HeldCell("a.pcd"), m.HeldCell("b.pcd", U64, ("points",))),
             bytes([1, 0, 0, 0, 0, 0, 0, 0]),
+            None,
+            None,
+            "b.pcd",
         ),
         [
             "differential",
@@ -73,11 +78,12 @@ REQUESTS: list[tuple[Any, list[Any], str]] = [
             b"\x01\x00\x00\x00\x00\x00\x00\x00",
             None,
             None,
+            "b.pcd",
         ],
         (
-            "98ac646966666572656e7469616c0496a6737175617265cb3ff0000000000000cb40000000000000"
+            "99ac646966666572656e7469616c0496a6737175617265cb3ff0000000000000cb40000000000000"
             "00cb4008000000000000c0c091a6706f696e74739293a5612e706364c0c093a5622e706364cfffff"
-            "ffffffffffff91a6706f696e7473c4080100000000000000c0c0"
+            "ffffffffffff91a6706f696e7473c4080100000000000000c0c0a5622e706364"
         ),
     ),
     (
@@ -185,6 +191,7 @@ REPLIES: list[tuple[Any, list[Any], str]] = [
             ("points",),
             False,
             "offline",
+            "a.pcd",
         ),
         [
             "cells",
@@ -209,14 +216,15 @@ REPLIES: list[tuple[Any, list[Any], str]] = [
             ["points"],
             False,
             "offline",
+            "a.pcd",
         ],
         (
-            "9ca563656c6c73040305919ca5612e70636401a6706f696e7473a2303000cd200009cb0000000000"
+            "9da563656c6c73040305919ca5612e70636401a6706f696e7473a2303000cd200009cb0000000000"
             "000000cb0000000000000000cb4034000000000000cb4034000000000000c291a5622e706364c408"
             "02000000000000009192a163a6706f696e74739296a164a6706f696e7473ab6f7665725f62756467"
             "6574a26e6f9197000000a7756e6b6e6f776e0801a094cb0000000000000000cb0000000000000000"
             "cb4034000000000000cb403400000000000096a165a6706f696e7473ac756e6b6e6f776e5f63656c"
-            "6ca26e6f90c091a6706f696e7473c2a76f66666c696e65"
+            "6ca26e6f90c091a6706f696e7473c2a76f66666c696e65a5612e706364"
         ),
     ),
     (
@@ -785,7 +793,7 @@ def test_elements_that_a_reply_lacks_have_their_defaults() -> None:
     (elements,) = [elements for message, elements, _ in REPLIES if isinstance(message, m.Cells)]
     reply = decode_reply(pack(elements[:9]))
     assert isinstance(reply, m.Cells)
-    assert (reply.layers, reply.covered, reply.reason) == ((), True, "")
+    assert (reply.layers, reply.covered, reply.reason, reply.next) == ((), True, "", "")
 
 
 def test_statistics_print_as_one_line() -> None:

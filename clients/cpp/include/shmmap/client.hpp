@@ -19,9 +19,11 @@
 #include <cstdlib>
 #include <ctime>
 #include <functional>
+#include <iterator>
 #include <memory>
 #include <mutex>
 #include <optional>
+#include <set>
 #include <string>
 #include <string_view>
 #include <unordered_map>
@@ -169,12 +171,13 @@ class Client {
   /// take to load (at most 3600); none: only cells in memory, the others are `pending` and being loaded.
   Answer area(const Area& area, const std::vector<std::string>& layers = {"points"},
               std::optional<double> wait = default_wait, const std::optional<Intent>& intent = std::nullopt) {
-    return cells("area", wait, [&](detail::Writer& to) {
+    return cells("area", wait, [&](detail::Writer& to, const std::optional<double>& left, const std::string& start) {
       detail::write(to, area);
       detail::write(to, layers);
-      detail::write(to, wait);
+      detail::write(to, left);
       detail::write(to, intent);
-    }, 4);
+      to.text(start);
+    }, 5);
   }
 
   /// Cells of an area that the client lacks, and cells that it should drop; apply removals before additions.
@@ -183,20 +186,37 @@ class Client {
                       const std::vector<std::string>& layers = {"points"},
                       std::optional<double> wait = default_wait,
                       const std::optional<Intent>& intent = std::nullopt) {
-    return cells("differential", wait, [&](detail::Writer& to) {
-      write_differential(to, area, held, packed, layers, wait, intent);
-    }, 6);
+    const auto write = [&](detail::Writer& to, const std::optional<double>& left, const std::string& start) {
+      write_differential(to, area, held, packed, layers, left, intent, start);
+    };
+    return cells("differential", wait, write, 7);
   }
 
   /// Cells by id, in that order.
   Answer selected(const std::vector<std::string>& ids, const std::vector<std::string>& layers = {"points"},
                   std::optional<double> wait = default_wait, const std::optional<Intent>& intent = std::nullopt) {
-    return cells("selected", wait, [&](detail::Writer& to) {
-      detail::write(to, ids);
-      detail::write(to, layers);
-      detail::write(to, wait);
-      detail::write(to, intent);
-    }, 4);
+    check_wait(wait);
+    const auto end = after(wait.value_or(0.0));
+    const auto most = std::max<std::size_t>(1, detail::max_selected / std::max<std::size_t>(1, layers.size()));
+    std::vector<Answer> parts;
+    const auto ask = [&](std::size_t part, const std::optional<double>& left) {
+      const auto first = ids.begin() + static_cast<std::ptrdiff_t>(std::min(part * most, ids.size()));
+      const auto last = ids.begin() + static_cast<std::ptrdiff_t>(std::min((part + 1) * most, ids.size()));
+      return one_answer("selected", left, [&](detail::Writer& to) {
+        detail::write(to, std::vector<std::string>(first, last));
+        detail::write(to, layers);
+        detail::write(to, left);
+        detail::write(to, intent);
+      }, 4).first;
+    };
+    const std::size_t count = std::max<std::size_t>(1, (ids.size() + most - 1) / most);
+    for (std::size_t part = 0; part < count; ++part)  // the last one waits, when all loads have begun
+      parts.push_back(ask(part, part + 1 < count ? std::nullopt : left_of(wait, end)));
+    for (std::size_t part = 0; part + 1 < count && Clock::now() < end; ++part)
+      if (!parts[part].pending.empty()) parts[part] = ask(part, left_of(wait, end));
+    Answer whole = std::move(parts.front());
+    for (std::size_t part = 1; part < count; ++part) append(whole, std::move(parts[part]));
+    return whole;
   }
 
   /// The cells of the map (of an area of it), whether they are in memory or not.
@@ -516,7 +536,8 @@ class Client {
 
   static void write_differential(detail::Writer& to, const Area& area, const std::vector<Held>& held,
                                  const std::vector<std::uint64_t>& packed, const std::vector<std::string>& layers,
-                                 const std::optional<double>& wait, const std::optional<Intent>& intent) {
+                                 const std::optional<double>& wait, const std::optional<Intent>& intent,
+                                 const std::string& start) {
     detail::write(to, area);
     detail::write(to, layers);
     to.array(held.size());
@@ -524,12 +545,97 @@ class Client {
     to.binary(packed.data(), packed.size() * sizeof(std::uint64_t));
     detail::write(to, wait);
     detail::write(to, intent);
+    to.text(start);
   }
 
-  template <typename Write>
-  Answer cells(std::string_view tag, const std::optional<double>& wait, const Write& write, std::size_t elements) {
+  static void check_wait(const std::optional<double>& wait) {
     if (wait && !(*wait >= 0.0 && *wait <= 3600.0))
       throw BadRequest("bad_request", "wait is 0 to 3600 seconds, not " + detail::short_text(*wait));
+  }
+
+  /// What is left of a wait.
+  static std::optional<double> left_of(const std::optional<double>& wait, Clock::time_point end) {
+    if (!wait) return std::nullopt;
+    return std::max(0.0, std::chrono::duration_cast<detail::Seconds>(end - Clock::now()).count());
+  }
+
+  /// Add the answer to the next part of a request.  The map may change between two of them: its version is that of
+  /// the first, after which all that changed is new.
+  static void append(Answer& whole, Answer&& part) {
+    const auto move = [](auto& to, auto& from) {
+      to.insert(to.end(), std::make_move_iterator(from.begin()), std::make_move_iterator(from.end()));
+    };
+    move(whole.cells, part.cells);
+    move(whole.pending, part.pending);
+    move(whole.failed, part.failed);
+    move(whole.removed, part.removed);
+    move(whole.removed_versions, part.removed_versions);
+    whole.layers = std::move(part.layers);
+    whole.epoch = part.epoch;
+    whole.covered = whole.covered && part.covered;
+    if (whole.reason.empty()) whole.reason = std::move(part.reason);
+  }
+
+  /// Ask for the cells of an area, reply after reply.  Only the last one waits for loads, so that all have begun by
+  /// then; what was pending in the others is asked for again by id.
+  template <typename Write>
+  Answer cells(std::string_view tag, const std::optional<double>& wait, const Write& write, std::size_t elements) {
+    check_wait(wait);
+    const auto end = after(wait.value_or(0.0));
+    const auto ask = [&](const std::string& start) {
+      const auto left = left_of(wait, end);
+      return one_answer(tag, left, [&](detail::Writer& to) { write(to, left, start); }, elements);
+    };
+    auto [whole, next] = ask({});
+    if (next.empty()) return std::move(whole);
+    std::set<std::pair<std::string, std::string>> late;
+    while (!next.empty()) {
+      late.insert(whole.pending.begin(), whole.pending.end());
+      whole.pending.clear();
+      auto [more, after_it] = ask(next);
+      append(whole, std::move(more));
+      next = std::move(after_it);
+    }
+    add_late(whole, late, left_of(wait, end));
+    const auto key = [&whole = whole](const CellPtr& cell) {
+      return std::pair(std::string_view(cell->id),
+                       std::find(whole.layers.begin(), whole.layers.end(), cell->layer) - whole.layers.begin());
+    };
+    std::stable_sort(whole.cells.begin(), whole.cells.end(),
+                     [&](const CellPtr& one, const CellPtr& other) { return key(one) < key(other); });
+    return std::move(whole);
+  }
+
+  /// Ask again for cells that were pending, and add what has become of them.
+  void add_late(Answer& whole, const std::set<std::pair<std::string, std::string>>& late,
+                const std::optional<double>& wait) {
+    if (late.empty()) return;
+    if (wait.value_or(0.0) <= 0.0) {
+      whole.pending.insert(whole.pending.end(), late.begin(), late.end());
+      return;
+    }
+    std::vector<std::string> ids;
+    for (const auto& [id, layer] : late)
+      if (ids.empty() || ids.back() != id) ids.push_back(id);
+    Answer again = selected(ids, whole.layers, wait);
+    const auto is_late = [&late](const std::string& id, const std::string& layer) { return late.count({id, layer}) != 0; };
+    std::set<std::pair<std::string, std::string>> come;
+    for (const auto& cell : again.cells)
+      if (is_late(cell->id, cell->layer)) come.emplace(cell->id, cell->layer);
+    const auto is_outdated = [&come](const CellPtr& cell) { return come.count({cell->id, cell->layer}) != 0; };
+    whole.cells.erase(std::remove_if(whole.cells.begin(), whole.cells.end(), is_outdated), whole.cells.end());
+    for (auto& cell : again.cells)
+      if (is_late(cell->id, cell->layer)) whole.cells.push_back(std::move(cell));
+    for (auto& one : again.pending)
+      if (is_late(one.first, one.second)) whole.pending.push_back(std::move(one));
+    for (auto& one : again.failed)  // one that is unknown has left the map
+      if (one.code != "unknown_cell" && is_late(one.id, one.layer)) whole.failed.push_back(std::move(one));
+  }
+
+  /// Ask once and map the cells of the reply; returns them, and where to go on.
+  template <typename Write>
+  std::pair<Answer, std::string> one_answer(std::string_view tag, const std::optional<double>& wait,
+                                            const Write& write, std::size_t elements) {
     report_unmapped();
     const auto deadline = after(wait.value_or(0.0) + options_.timeout);
     auto found = one_reply(tag, wait.value_or(0.0), write, elements);
@@ -545,7 +651,7 @@ class Client {
     for (const auto at : gone) answer.pending.emplace_back(whole(found.handles[at].id), found.handles[at].layer);
     for (auto& cell : places)
       if (cell) answer.cells.push_back(std::move(cell));
-    return std::move(answer);
+    return {std::move(answer), std::move(found.next)};
   }
 
   template <typename Write>
@@ -592,7 +698,11 @@ class Client {
     const auto add = [](std::vector<std::string>& to, const std::string& one) {
       if (std::find(to.begin(), to.end(), one) == to.end()) to.push_back(one);
     };
-    for (const auto at : gone) add(ids, handles[at].id), add(layers, handles[at].layer);
+    for (const auto at : gone) add(layers, handles[at].layer);
+    const std::size_t most = std::max<std::size_t>(1, detail::max_selected / layers.size());
+    const auto is_asked = [&ids](const std::string& id) { return std::find(ids.begin(), ids.end(), id) != ids.end(); };
+    for (const auto at : gone)
+      if (ids.size() < most) add(ids, handles[at].id);
     const std::optional<double> wait = options_.timeout / 2.0;
     auto found = one_reply("selected", *wait, [&](detail::Writer& to) {
       detail::write(to, ids);
@@ -601,6 +711,10 @@ class Client {
     }, 3);
     std::vector<std::size_t> still;
     for (const auto at : std::exchange(gone, {})) {
+      if (!is_asked(handles[at].id)) {
+        still.push_back(at);
+        continue;
+      }
       const auto is_it = [&](const auto& one) {
         return whole(one.id) == whole(handles[at].id) && one.layer == handles[at].layer;
       };

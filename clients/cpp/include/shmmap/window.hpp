@@ -117,6 +117,7 @@ struct Question {
   Area area;
   Clock::time_point asked;
   bool by_name = false;  // held cells are sent by id, as is necessary after a daemon's restart
+  std::string start = {};  // where it goes on, if its cells do not fit into one reply
 };
 
 }  // namespace detail
@@ -342,12 +343,18 @@ class Window {
   /// Begin a request for the missing cells of the area around the pose.
   void ask(std::optional<double> wait, bool by_name) {
     client_.report_unmapped();
-    question_ = detail::Question{*pose_, area_around(*pose_), Clock::now(), by_name};
+    so_far_.reset();
+    send({*pose_, area_around(*pose_), Clock::now(), by_name}, wait);
+  }
+
+  void send(detail::Question question, std::optional<double> wait) {
+    question_ = std::move(question);
+    const bool by_name = question_.by_name && cells_.size() <= detail::max_named;
     const auto number = client_.next_request();
-    auto message = Client::begun("differential", number, 6);
+    auto message = Client::begun("differential", number, 7);
     Client::write_differential(message, question_.area, by_name ? named() : std::vector<Held>{},
                                by_name ? std::vector<std::uint64_t>{} : packed(), options_.layers, wait,
-                               question_.pose);
+                               question_.pose, question_.start);
     client_.begin(number, message.data(), "cells", wait.value_or(0.0));
   }
 
@@ -393,9 +400,22 @@ class Window {
     const bool are_gone = !arriving_->gone.empty();
     if (are_gone && were_gone_) client_.check_visible();
     were_gone_ = are_gone;
+    const std::string next = std::move(arriving_->reply.next);
     arriving_.reset();
     error_.reset();
     stale_since_.reset();
+    if (so_far_) {
+      Client::append(*so_far_, std::move(answer));
+      answer = std::move(*so_far_);
+      so_far_.reset();
+    }
+    if (!next.empty()) {  // go on with the same pose, and with the cells held before
+      so_far_ = std::move(answer);
+      auto question = question_;
+      question.start = next;
+      send(std::move(question), std::nullopt);
+      return;
+    }
     if (answer.epoch != epoch_ && !cells_.empty() && !question_.by_name) {
       // A restarted daemon cannot resolve versions of an earlier run, and treats those that are not current as
       // unknown.  Mapped cells stay mapped during the next request.
@@ -516,6 +536,7 @@ class Window {
   Client client_;
   WindowOptions options_;
   std::optional<detail::Arriving> arriving_;
+  std::optional<Answer> so_far_;  // the replies to a question before its last one
   detail::Question question_;
   bool made_progress_ = false;   // with the last reply
   bool were_gone_ = false;       // segments of the last reply

@@ -202,7 +202,7 @@ def _serve(args: argparse.Namespace) -> int:
     """Show the daemon's map to browsers until a signal."""
     from shmmap.cli.verbs.look.metrics_server import listen_address
     from shmmap.viewing.browser.door import Door, bound, open_server
-    from shmmap.viewing.browser.live_view import LiveView, refuse_older
+    from shmmap.viewing.browser.live_view import LiveView
 
     area = area_from(args)
     host, port = listen_address(args.listen or str(_PORT))
@@ -210,7 +210,6 @@ def _serve(args: argparse.Namespace) -> int:
         connect(args, "shmmap view") as client,
         bound(host, port, is_fixed=args.listen is not None) as listening,
     ):
-        refuse_older(client.welcome)
         if args.follow is not None:
             args.follow = _client(client.stats().sessions, args.follow).name
         door = Door(host)

@@ -211,7 +211,7 @@ def test_heights() -> None:
     heights.learn(4, 5.0, 6.0)
     heights.forget(np.array([4]))
     assert (heights.get(1), heights.get(0), heights.get(4)) == ((-1.0, 2.0), None, None)
-    assert heights.overlapping([4, 3, 2, 1, 0], (2.0, 4.0)) == [4, 3, 1, 0]
+    assert heights.overlapping(np.array([4, 3, 2, 1, 0]), (2.0, 4.0)).tolist() == [4, 3, 1, 0]
 
 
 def load(one: InnerDaemon, request: int) -> Resident:

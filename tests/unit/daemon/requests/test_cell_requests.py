@@ -12,6 +12,7 @@ from typing import NoReturn
 import msgspec
 import pytest
 
+from shmmap.daemon.cache import holders
 from shmmap.daemon.cache.holders import Holders
 from shmmap.daemon.records import Resident
 from shmmap.daemon.requests import cell_requests, limits
@@ -165,7 +166,7 @@ def test_waiting_requests_are_answered_in_turn(inner: Inner, small_map: DividedM
             one.ask(session, Selected(number, ("0_0.pcd",), wait=30.0))
     one.run_until(lambda: one.due)
     assert (len(one.due), one.replies) == (12, [])
-    one.cells.answer_overdue(one.now_s() + 60.0)
+    one.cells.answer_due(one.now_s() + 60.0)
     assert len(one.due) == 12, "each is due once"
     one.cells.on_disconnect(sessions[1])
     for count, answer in enumerate(one.due):
@@ -180,8 +181,8 @@ def test_a_request_whose_time_is_up_is_answered_in_turn(inner: Inner, small_map:
     one.hold_answers = True
     one.ask(one.session(), Selected(1, ("0_0.pcd",), wait=5.0))
     one.offset_s = 6.0
-    one.cells.answer_overdue(one.now_s())
-    assert (len(one.due), one.replies, one.cells.next_deadline_s()) == (1, [], float("inf"))
+    one.cells.answer_due(one.now_s())
+    assert (len(one.due), one.replies, one.cells.next_s()) == (1, [], float("inf"))
     finish(one.due[0])
     ((_, reply),) = one.replies
     assert [cell.id for cell in reply.pending] == ["0_0.pcd"]
@@ -192,8 +193,8 @@ def test_cells_of_one_request(inner: Inner, small_map: DividedMap, monkeypatch: 
     monkeypatch.setattr(limits, "MAX_CELLS", 15)
     with pytest.raises(BadRequest, match="more than 15 cells in one request"):
         one.ask(one.session(), Area(1, EVERYWHERE))
-    with pytest.raises(BadRequest, match="more than 15 cells"):  # known or not
-        one.ask(one.session(), Selected(2, ("nowhere",) * 16))
+    with pytest.raises(BadRequest, match="more than 128 cells selected"):  # known or not
+        one.ask(one.session(), Selected(2, ("nowhere",) * 43, ("points", "denoise", "voxel(leaf=1.0)")))
     assert not one.loads.by_key
     assert not one.ledger.by_key
     assert one.replies == []
@@ -287,26 +288,39 @@ def full(many: InnerDaemon, *, map_them: bool = False) -> tuple[Session, list[in
     return session, opened
 
 
-@pytest.mark.usefixtures("short_turns")
-def test_a_few_looks_a_turn(many: InnerDaemon, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_few_looks_a_request(many: InnerDaemon, monkeypatch: pytest.MonkeyPatch) -> None:
     """It holds 50 and maps none: enough of them are dropped for what it asks for now, the oldest first."""
     looks, look = 0, Holders.has
 
-    def counted(holders: Holders, resident: Resident, slot: int) -> bool:
+    def counted(found: Holders, resident: Resident, slot: int) -> bool:
         nonlocal looks
         looks += 1
-        return look(holders, resident, slot)
+        return look(found, resident, slot)
 
     monkeypatch.setattr(Holders, "has", counted)
     session, _ = full(many)
-    before = 0
-    for _ in many.cells.selected(session, Selected(2, ids(many, 50, 60) + ids(many, 0, 8), wait=30.0)):
-        assert looks - before <= 1
-        before = looks
-    assert len(many.cells_of(2).cells) == 18
+    assert (
+        len(many.cells_for(Selected(2, ids(many, 50, 60) + ids(many, 0, 8), wait=30.0), session).cells) == 18
+    )
     assert many.statistics.values["refused_quota"] == 0
     assert 10 <= looks < 50
     assert {r.key.cell_id for r in session.residents()} >= set(ids(many, 30, 60))
+
+
+def test_the_next_request_looks_at_others(many: InnerDaemon, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the 50 that it holds it still maps the first ones: looking at those alone finds no room."""
+    monkeypatch.setattr(holders, "MAX_LOOKS", 10)
+    session, opened = full(many, map_them=True)
+    for fd in opened[20:]:
+        os.close(fd)
+    found = []
+    for request in range(2, 6):
+        many.offset_s += 2.0
+        found.append(len(many.cells_for(Selected(request, ids(many, 50, 60), wait=30.0), session).cells))
+    assert found[:2] == [0, 0]
+    assert found[3] == 10
+    for fd in opened[:20]:
+        os.close(fd)
 
 
 def test_what_it_still_maps_counts(many: InnerDaemon) -> None:
@@ -328,7 +342,7 @@ class LongWay(Exception):
     """The request was answered with what covers everything."""
 
 
-def long_way(*_: object) -> NoReturn:
+def long_way(*_: object, **_options: object) -> NoReturn:
     raise LongWay
 
 

@@ -11,9 +11,11 @@ from pathlib import Path
 
 import pytest
 
+from shmmap.daemon.cache import holders
 from shmmap.daemon.cache.evictor import Freeing
+from shmmap.daemon.cache.holders import Holders
 from shmmap.daemon.loading.room import AHEAD_SHARE, Room
-from shmmap.daemon.records import Key
+from shmmap.daemon.records import Key, Resident
 from shmmap.protocol.messages import (
     Area,
     CircleMessage,
@@ -201,7 +203,7 @@ def test_duplicates_count_once_for_the_quota(inner: Inner, small_map: DividedMap
 
 def test_very_many_loads_are_refused_one_at_a_time(inner: Inner, tmp_path: Path) -> None:
     """Between loads that find no room another client may come, and the next one follows at once."""
-    made = make_map(tmp_path / "many", columns=12, rows=12, points=5)
+    made = make_map(tmp_path / "many", columns=11, rows=11, points=5)
     one = inner(str(made.root), budget_bytes=1 << 20)
     one.ledger.overhead_bytes = one.ledger.budget_bytes  # nothing fits, and nothing can make room
     one.ask(one.session(), Area(1, EVERYWHERE, wait=900.0))
@@ -214,19 +216,25 @@ def test_very_many_loads_are_refused_one_at_a_time(inner: Inner, tmp_path: Path)
     assert {failed.code for failed in one.cells_of(1).failed} == {"over_budget"}
 
 
-@pytest.mark.usefixtures("short_turns")
-def test_the_holders_of_memory_are_found_some_a_turn(inner: Inner, tmp_path: Path) -> None:
+def test_the_holders_of_memory_are_those_of_the_largest_segments(
+    inner: Inner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """However many segments there are; and it is said beside each cell that there is none for."""
-    made = make_map(tmp_path / "many", columns=12, rows=12, points=5)
+    made = make_map(tmp_path / "many", columns=8, rows=8, points=5)
     one = inner(str(made.root))
     one.everything()
     gone = one.ledger.by_key[Key(one.cache.catalogue.id(0), "points")]
     one.reclaimer.retire(gone, one.now_s() - 1.0)
     one.run_until(lambda: gone.name not in one.ledger.retired)
     one.ledger.overhead_bytes = one.ledger.budget_bytes
-    one.hold_answers = True
-    one.ask(one.session("asks"), Area(2, EVERYWHERE, wait=900.0))
-    one.run_until(lambda: one.due)
-    assert len(list(one.due.pop(0))) >= 143, "a segment a turn"
-    (failed,) = one.cells_of(2).failed
+    looks, look = list[Resident](), Holders.slots_of
+
+    def counted(found: Holders, resident: Resident) -> list[int] | None:
+        looks.append(resident)
+        return look(found, resident)
+
+    monkeypatch.setattr(Holders, "slots_of", counted)
+    monkeypatch.setattr(holders, "MAX_HOLDING_SEGMENTS", 10)
+    (failed,) = one.cells_for(Area(2, EVERYWHERE, wait=900.0)).failed
     assert (failed.code, failed.holders) == ("over_budget", ()), "nothing is mapped"
+    assert 0 < len(looks) <= 10

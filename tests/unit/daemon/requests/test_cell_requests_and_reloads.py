@@ -23,7 +23,7 @@ from shmmap.protocol.messages import (
 )
 from tests.support.divided_map import DividedMap, random_points
 from tests.support.segment_reader import map_segment, parse
-from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner, finish, names
+from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner, names
 
 
 def rewrite(made: DividedMap, name: str, points: int, corner: tuple[int, int] | None = None) -> None:
@@ -213,24 +213,6 @@ def test_moved_cells_are_loaded_again_with_their_box(inner: Inner, small_map: Di
     assert [(cell.min_x, cell.min_y) for cell in reply.cells] == [(400.0, 400.0), (500.0, 500.0)]
     for cell in reply.cells:
         assert parse(map_segment(one.path_of(cell.segment))).fields["box"][:2] == (cell.min_x, cell.min_y)
-
-
-@pytest.mark.usefixtures("short_turns")
-def test_indices_change_between_the_turns_of_a_request(inner: Inner, small_map: DividedMap) -> None:
-    """What was found is found again in the map that is served then."""
-    one = inner(small_map.root)
-    first, second = ["20_20.pcd", "0_0.pcd"] * 8, ["20_0.pcd", "20_20.pcd"]
-    work = one.cells.selected(one.session(), Selected(1, (*first, *second), wait=30.0))
-    for _ in first:
-        next(work)
-    small_map.remove_cell("-40_-40.pcd")
-    small_map.remove_cell("0_0.pcd")
-    small_map.write_metadata()
-    one.reload()
-    finish(work)
-    reply = one.cells_of(1)
-    assert names(reply) == ["20_20.pcd"] * 8 + second
-    assert [failed.code for failed in reply.failed] == ["unknown_cell"] * 8
 
 
 def test_an_empty_map(inner: Inner, small_map: DividedMap) -> None:

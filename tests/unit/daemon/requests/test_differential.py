@@ -21,15 +21,13 @@ from hypothesis import strategies as st
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.records import Key
-from shmmap.daemon.requests.differential import difference, warm_difference
-from shmmap.daemon.requests.pending_request import Found, PendingRequest
-from shmmap.daemon.transport.sessions import Sessions
+from shmmap.daemon.requests.differential import Difference, difference, warm_difference
 from shmmap.errors import BadRequest
+from shmmap.layers import versions as layer_versions
 from shmmap.protocol.codec import pack_versions, unpack_versions
-from shmmap.protocol.messages import Area, BoxMessage, Differential, HeldCell
-from tests.support import connections
+from shmmap.protocol.messages import MAX_NAMED, Area, BoxMessage, Differential, HeldCell
 from tests.support.divided_map import DividedMap, make_map, random_points
-from tests.unit.daemon.inner_daemon import InnerDaemon, finish
+from tests.unit.daemon.inner_daemon import InnerDaemon
 
 COLD = "20_20.pcd"
 BROKEN = "20_0.pcd"
@@ -82,12 +80,9 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     inner.close()
 
 
-def find(cache: CellCache, message: Differential, indices: list[int], layers: tuple[str, ...]) -> Found:
+def find(cache: CellCache, message: Differential, indices: list[int], layers: tuple[str, ...]) -> Difference:
     """Find the difference."""
-    session = Sessions().open(connections.of(), "", 0.0)
-    wanted = PendingRequest(cache, session, 1, layers, lambda _wanted: iter(()), found=Found(cache.catalogue))
-    finish(difference(wanted, message, indices, layers))
-    return wanted.found
+    return difference(cache, message, np.array(indices, dtype=np.intp), layers)
 
 
 def oracle(
@@ -225,33 +220,68 @@ def test_packed_versions_of_broken_length(served: Served, packed: bytes) -> None
 
 
 def test_very_many_held(served: Served) -> None:
-    """100 000 held entries, all but one of them unknown: each is to be dropped, in their order."""
-    rows = [HeldCell(f"gone/{number}.pcd", number + 1) for number in range(100_000)]
-    rows.insert(50_000, HeldCell("0_0.pcd", served.current["0_0.pcd"]))
+    """As many as a request may name, all but one of them unknown: each is to be dropped, in their order."""
+    rows = [HeldCell(f"gone/{number}.pcd", number + 1) for number in range(MAX_NAMED - 1)]
+    rows.insert(1000, HeldCell("0_0.pcd", served.current["0_0.pcd"]))
     index = served.names.index("0_0.pcd")
     message = Differential(1, EVERYWHERE, held=tuple(rows))
     expected = [row.id for row in rows if row.id != "0_0.pcd"]
     found = find(served.inner.cache, message, [index], ("points",))
     assert (found.cells, list(found.removed)) == ([], expected)
     warm = warm_difference(served.inner.cache, message, np.array([index], dtype=np.intp), "points")
-    assert warm is None, "it would take a turn of tens of milliseconds"
+    assert warm is None
 
 
-def test_very_many_packed_take_many_turns(served: Served) -> None:
+def test_very_many_packed(served: Served) -> None:
     """Versions of every first digit, each twice, and those of the map among them: as the oracle says."""
     inside = [name for name in served.names if name not in (BROKEN, NAMES[0])]
-    spread = [(number % 16 << 60) | number + 1 for number in range(50_000)]
+    spread = [(number % 16 << 60) | number + 1 for number in range(9_000)]
     packed = [*spread, *spread, *served.current.values(), *served.old.values()]
     message = Differential(1, EVERYWHERE, packed=pack_versions(packed))
     indices = [served.names.index(name) for name in inside]
     cache = served.inner.cache
     assert warm_difference(cache, message, np.array(indices, dtype=np.intp), "points") is None
-    session = Sessions().open(connections.of(), "", 0.0)
-    wanted = PendingRequest(cache, session, 1, ("points",), lambda _: iter(()), found=Found(cache.catalogue))
-    turns = sum(1 for _ in difference(wanted, message, indices, ("points",)))
-    assert turns >= 16, "a part of the versions a turn, at most"
+    found = find(cache, message, indices, ("points",))
     new, _, gone, other = oracle(served, inside, [], [*set(packed)], ("points",))
-    assert [(served.names[index], layer) for index, layer in wanted.found.cells] == new == []
-    removed = unpack_versions(wanted.found.removed_packed)
+    assert [(served.names[index], layer) for index, layer in found.cells] == new == []
+    removed = unpack_versions(found.removed_packed)
     assert (set(removed), len(removed)) == (gone, len(gone))
-    assert {Path(key.cell_id).name for key in wanted.found.held_old} == other == {CHANGED}
+    assert {Path(key.cell_id).name for key in found.held_old} == other == {CHANGED}
+
+
+@pytest.mark.parametrize("most", [1, 3, 5, 100])
+def test_from_any_place_on(served: Served, most: int) -> None:
+    """Part after part, each of whole cells, the parts are the whole."""
+    layers, cache = ("points", "voxel(leaf=1.0)"), served.inner.cache
+    area = np.arange(16)
+    held = [served.current[name] for name in served.names[2:9]]
+    message = Differential(1, EVERYWHERE, packed=pack_versions(held))
+    whole = difference(cache, message, area, layers)
+    assert (len(whole.cells), whole.looked_at) == (32 - 7, 16)
+    found, start = list[tuple[int, str]](), 0
+    while start < 16:
+        part = difference(cache, message, area, layers, start=start, most=most)
+        assert len(part.cells) <= most + 1
+        start += part.looked_at
+        assert all(index < start for index, _ in part.cells)
+        found += part.cells
+    assert found == whole.cells
+
+
+def test_versions_that_take_long_are_found_some_at_a_time(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is unknown by then is neither lacked nor dropped."""
+    layers, cache = ("denoise",), served.inner.cache
+    area, versions = np.arange(16), [cache.layers.version(index, "denoise") for index in range(16)]
+    message = Differential(1, EVERYWHERE, packed=pack_versions([*versions[1:], 77]))
+    cache.layers.forget()
+    monkeypatch.setattr(layer_versions, "COMPUTED_AT_ONCE", 3 * layer_versions.HALO_COST)
+    first = difference(cache, message, area, layers)
+    assert (first.cells, first.looked_at, first.removed_packed) == ([(0, "denoise")], 3, b"")
+    start = first.looked_at
+    while start < 16:
+        part = difference(cache, message, area, layers, start=start)
+        assert part.cells == []
+        start += part.looked_at
+    assert part.removed_packed == pack_versions([77])

@@ -74,7 +74,9 @@ inline void write(Writer& to, const Held& held) {
   if (!held.layers.empty()) write(to, held.layers);
 }
 
-inline constexpr std::uint64_t protocol_major = 2, protocol_minor = 0;
+inline constexpr std::uint64_t protocol_major = 3, protocol_minor = 0;
+inline constexpr std::size_t max_selected = 128;  // layers of cells in a request by id
+inline constexpr std::size_t max_named = 2048;    // cells that one request names as held
 
 /// The daemon's properties in its welcome.
 struct Welcome {
@@ -127,6 +129,7 @@ inline Handle read_handle(Reader& reader) {
 struct Cells {
   Answer answer;
   std::vector<Handle> handles;
+  std::string next;  // where to go on, if there are more cells than one reply has
 };
 
 inline Cells read_cells(Reader& reader, Row& row) {
@@ -166,6 +169,7 @@ inline Cells read_cells(Reader& reader, Row& row) {
     for (auto left = reader.array(); left > 0; --left) answer.layers.emplace_back(reader.text());
   if (row.next()) answer.covered = reader.boolean();
   if (row.next()) answer.reason = reader.text();
+  if (row.next()) found.next = reader.text();
   row.end();
   return found;
 }
