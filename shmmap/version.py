@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 from functools import cache
 
-__version__ = "0.3.0"
+__version__ = "0.4.0"
 
 _DIGITS = 8
 

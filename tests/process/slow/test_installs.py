@@ -59,7 +59,7 @@ def test_versions_side_by_side(reader: Reader, clone: Path, tmp_path: Path) -> N
     with index_or_skip():
         user.run(install.replace("/opt/", f"{here}/"))
     user.run(switch.replace("/opt/", f"{here}/"))
-    assert [path.name for path in sorted(here.iterdir())] == ["shmmap", "shmmap-0.2.0", "shmmap-0.3.0"]
+    assert [path.name for path in sorted(here.iterdir())] == ["shmmap", "shmmap-0.2.0", "shmmap-0.4.0"]
     found = reader.terminal().run(f"'{here}/shmmap/bin/python' -c 'import shmmap; print(shmmap.__file__)'")
     assert found.startswith(str(here))
 

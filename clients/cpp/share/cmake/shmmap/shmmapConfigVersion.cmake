@@ -3,7 +3,7 @@
 # Which versions find_package(shmmap VERSION) takes this one for: older ones of the same major number, and while
 # that is 0, of the same minor number (https://semver.org/).
 
-set(PACKAGE_VERSION 0.3.0)
+set(PACKAGE_VERSION 0.4.0)
 
 string(REGEX MATCH "^(0\\.[0-9]+|[0-9]+)" _shmmap_series "${PACKAGE_VERSION}")
 if("${PACKAGE_FIND_VERSION}" VERSION_LESS_EQUAL "${PACKAGE_VERSION}"
