@@ -88,7 +88,7 @@ class EvictionPlan:
     listed
         The candidates, the one that goes first at the end.
     is_whole
-        Whether all candidates were listed.
+        Whether all candidates were listed, but for some whose grace ends later.
     """
 
     places: Places = field(default_factory=lambda: NOWHERE)
@@ -113,6 +113,7 @@ class EvictionPlan:
             if len(some) == block:
                 yield
         self.listed = sorted(heap)
+        self.is_whole |= bool(heap) and not self.listed[-1].is_past_grace  # others are in their grace, too
 
     def add(self, some: Sequence[Resident]) -> None:
         """List some more."""

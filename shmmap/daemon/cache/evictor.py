@@ -213,7 +213,7 @@ class Evictor:
         """List what has come into question since, or make a part of the next plan; False if none is left."""
         plan, evictable = self._plan, self.reclaimer.ledger.evictable
         too_many = max(len(evictable.new), len(plan.listed) - MAX_LISTED) > BLOCK
-        if self._making is None and not too_many and (plan.is_whole or plan.listed):
+        if self._making is None and not too_many and plan.is_whole:
             some = [evictable.new.popitem()[0] for _ in range(len(evictable.new))]
             plan.add([resident for resident in some if self._may_go(resident, now_s)])
             return bool(some)

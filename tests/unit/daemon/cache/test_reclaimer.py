@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from shmmap.daemon.cache import reclaimer
+from shmmap.daemon.cache import eviction_plan, reclaimer
 from shmmap.daemon.cache.eviction_plan import BLOCK, HAND_OUT_GRACE_S
 from shmmap.daemon.cache.evictor import LOOKS_PER_CALL, PLAN_S, PRESSURE_S, STEP_S, Evictor, Freeing
 from shmmap.daemon.cache.ledger import Ledger
@@ -366,6 +366,34 @@ def test_of_many_the_first_go_when_all_have_been_looked_at(memory: Memory) -> No
     assert evicted(memory, rest, at_s) == some[100:]
     assert evicted(memory, 1, at_s) == [last]
     assert evictor.free(memory.ledger.coming_bytes + 1, at_s) is Freeing.NO_MORE
+
+
+def test_another_plan_is_made_when_all_that_was_listed_has_been_used_or_gone(
+    memory: Memory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Only some were listed: those that were used since, or wait for the end of their grace, come last."""
+    monkeypatch.setattr(eviction_plan, "MAX_LISTED", 4)
+    some = memory.publish(10)
+    for number, resident in enumerate(some):
+        resident.last_use_s = number / 1e3
+    assert evicted(memory, 1, NOW_S) == some[:1]
+    some[1].last_use_s = NOW_S - 2.0
+    some[2].last_use_s = NOW_S
+    assert evicted(memory, 7, NOW_S) == [some[3], *some[4:]][:7]
+    assert evicted(memory, 1, NOW_S) == [some[1]]
+    memory.until_it_waits(memory.ledger.coming_bytes + SMALL, NOW_S)
+    assert memory.evictor.wake_s == NOW_S + HAND_OUT_GRACE_S
+
+
+def test_while_all_are_in_their_grace_no_other_plan_is_made(
+    memory: Memory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(eviction_plan, "MAX_LISTED", 4)
+    for number, resident in enumerate(memory.publish(10)):
+        resident.last_use_s = NOW_S - 0.5 + number / 1e3
+    memory.until_it_waits(SMALL, NOW_S)
+    assert memory.evictor.wake_s == NOW_S + 0.5
+    assert evicted(memory, 1, NOW_S + 0.5)[0].last_use_s == NOW_S - 0.5
 
 
 def test_the_first_plan_is_made_before_memory_is_short(memory: Memory) -> None:
