@@ -6,7 +6,7 @@ from __future__ import annotations
 import contextlib
 import math
 import mmap
-from collections.abc import Hashable, Iterator, MutableMapping
+from collections.abc import Hashable, Iterable, Iterator, MutableMapping
 from typing import Any, Final, TypeVar, overload
 
 import numpy as np
@@ -75,6 +75,12 @@ class ShardedDict(MutableMapping[K, V]):
             if shard:
                 return shard.popitem()
         raise KeyError("it is empty")
+
+    def among(self, keys: Iterable[K]) -> list[K]:
+        """Return which of many keys are in it."""
+        shards = self._shards
+        count = len(shards)
+        return [key for key in keys if key in shards[hash(key) % count]]
 
     def __bool__(self) -> bool:
         return any(self._shards)

@@ -27,7 +27,7 @@ MAX_NEIGHBOURS: Final = 64
 TABLES_BYTES: Final = 64 << 20
 """Memory of all tables; each takes 8 bytes per cell of the map, but untouched pages of it take none."""
 LEAST_TABLES: Final = 4
-COMPUTED_AT_ONCE: Final = 512
+COMPUTED_AT_ONCE: Final = 1024
 """Versions that one call of `LayerVersions.of_cells` computes."""
 HALO_COST: Final = 16
 """Versions that are hashed in the time in which one neighbourhood is searched."""

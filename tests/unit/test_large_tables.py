@@ -51,6 +51,7 @@ def test_it_does_what_a_dict_does(steps: list[tuple[str, int]]) -> None:
         assert ours.get(key) == plain.get(key)
         assert (key in ours) == (key in plain)
         assert bool(ours) == bool(plain)
+    assert ours.among(range(-1, 42)) == [one for one in range(-1, 42) if one in plain]
     assert ours == plain
     assert (len(ours), set(ours), sorted(ours.values())) == (len(plain), set(plain), sorted(plain.values()))
 

@@ -213,13 +213,14 @@ def _mark_gone(
     catalogue, of_version = cache.catalogue, cache.warm.of_version
     others = found.held[~_among(found.held, np.sort(current, axis=None))].tolist()
     inside = set(map(catalogue.id, area.tolist())) if others else ()
-    gone: list[int] = []
-    for version in others:
-        key = of_version.get(version)
-        if key is not None and key.cell_id in inside:
-            found.held_old.add(key)
-        elif (covered and complete) or (key is not None and catalogue.find(key.cell_id) is not None):
-            gone.append(version)  # else it may be current somewhere in the area
+    known = {version: of_version[version] for version in of_version.among(others)}
+    replaced = {version for version, key in known.items() if key.cell_id in inside}
+    found.held_old.update(known[version] for version in replaced)
+    if covered and complete:
+        gone = set(others) - replaced
+    else:  # what is not known may be current somewhere in the area
+        elsewhere = known.keys() - replaced
+        gone = {version for version in elsewhere if catalogue.find(known[version].cell_id) is not None}
     found.removed_packed = pack_versions(gone)
 
 

@@ -36,6 +36,8 @@ from shmmap.protocol.codec import decode_request, encode, request_number, unpack
 from shmmap.protocol.live import LIVE_REQUESTS
 from shmmap.statistics.writer import StatisticsWriter
 
+RELEASED_PER_STEP: Final = 16
+"""Versions released between two looks at the time."""
 MAX_DEFECTS: Final = 100
 WITHIN_S: Final = 10.0
 """`MAX_DEFECTS` exceptions from one line of code within this time are fatal; one of them is logged."""
@@ -156,9 +158,9 @@ class Dispatch:
     def _release(self, session: Session, message: messages.Release) -> Iterator[None]:
         versions = list(session.held) if message.packed is None else unpack_versions(message.packed)
         pace = Pace()
-        for version in versions:
+        for begin in range(0, len(versions), RELEASED_PER_STEP):
             yield from pace.pause()
-            self.cells.release(session.drop((version,)))
+            self.cells.release(session.drop(versions[begin : begin + RELEASED_PER_STEP]))
         session.connection.reply(encode(messages.Released(message.request)))
 
     def _answer_stats(self, session: Session, message: messages.Stats, usage: Usage) -> Iterator[None]:

@@ -12,7 +12,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from shmmap.daemon.requests import cell_requests, limits
+from shmmap.daemon.requests import cell_requests, dispatch, limits
 from shmmap.daemon.requests.dispatch import Dispatch
 from shmmap.daemon.transport.sessions import Session
 from shmmap.errors import BadRequest
@@ -297,7 +297,10 @@ def test_what_came_for_another_client_meanwhile_is_not_loaded_again(inner: Inner
 
 
 @pytest.mark.usefixtures("short_turns")
-def test_very_much_is_released_in_several_turns(inner: Inner, made: DividedMap) -> None:
+def test_very_much_is_released_in_several_turns(
+    inner: Inner, made: DividedMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dispatch, "RELEASED_PER_STEP", 1)
     one = inner(str(made.root))
     session = one.session()
     versions = [cell.version for cell in one.all_for(Area(1, EVERYWHERE, wait=LONG_S), session).cells]
@@ -309,7 +312,7 @@ def test_very_much_is_released_in_several_turns(inner: Inner, made: DividedMap) 
 
 
 def release(one: InnerDaemon, session: Session, versions: list[int]) -> Any:
-    dispatch = Dispatch(*[None] * len(fields(Dispatch)))  # type: ignore[arg-type]
-    dispatch.cells = one.cells
-    dispatch.handshake = cast("Any", SimpleNamespace(sessions=one.sessions))
-    return dispatch._route(session.connection, Release(9, pack_versions(versions)), b"") or ()
+    made = Dispatch(*[None] * len(fields(Dispatch)))  # type: ignore[arg-type]
+    made.cells = one.cells
+    made.handshake = cast("Any", SimpleNamespace(sessions=one.sessions))
+    return made._route(session.connection, Release(9, pack_versions(versions)), b"") or ()
