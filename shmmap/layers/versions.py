@@ -27,7 +27,7 @@ MAX_NEIGHBOURS: Final = 64
 TABLES_BYTES: Final = 64 << 20
 """Memory of all tables; each takes 8 bytes per cell of the map, but untouched pages of it take none."""
 LEAST_TABLES: Final = 4
-COMPUTED_AT_ONCE: Final = 1024
+COMPUTED_PER_BATCH: Final = 1024
 """Versions that one call of `LayerVersions.of_cells` computes."""
 HALO_COST: Final = 16
 """Versions that are hashed in the time in which one neighbourhood is searched."""
@@ -140,7 +140,7 @@ class LayerVersions:
             Whether all versions are known.
         """
         cost = sum(HALO_COST if _kind(layer).halo_m else 1 for layer in layers)
-        count, most = len(cells), max(1, COMPUTED_AT_ONCE // max(1, cost))
+        count, most = len(cells), max(1, COMPUTED_PER_BATCH // max(1, cost))
         versions = np.empty((count, len(layers)), np.uint64)
         for column, layer in enumerate(layers):
             table = self._table(layer)

@@ -24,7 +24,7 @@ MAX_WEIGHT: Final = 200_000
 PACKED_PER_CELL: Final = 256
 HELD_PER_CELL: Final = 2
 """Bytes of packed versions, and cells held by name, that weigh as much as one requested cell."""
-TAKEN_AT_ONCE: Final = 256
+TAKEN_PER_TURN: Final = 256
 
 Message: TypeAlias = messages.Area | messages.Differential | messages.Selected
 Awaited = TypeVar("Awaited")
@@ -200,9 +200,9 @@ class WaitingList:
 
     def take(self, now_s: float) -> list[CellRequest]:
         """Take requests that have nothing left to wait for, or whose time is over; a bounded number."""
-        while self._first_deadline_s() <= now_s and len(self._due) < TAKEN_AT_ONCE:
+        while self._first_deadline_s() <= now_s and len(self._due) < TAKEN_PER_TURN:
             self._set_due(heapq.heappop(self._heap)[2])
-        taken = list(self._due)[:TAKEN_AT_ONCE]
+        taken = list(self._due)[:TAKEN_PER_TURN]
         for request in taken:
             del self._due[request]
         return taken

@@ -247,7 +247,7 @@ class InnerDaemon:
                 return
 
     def all_for(self, message: Area | Differential, session: Session | None = None) -> Cells:
-        """Serve a request reply after reply, and anew until nothing is pending; return all cells."""
+        """Serve a request reply after reply, then again until nothing is pending; return all cells."""
         while True:
             whole = joined(list(self.parts_for(message, session)))
             if not whole.pending:

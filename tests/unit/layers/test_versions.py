@@ -154,7 +154,7 @@ def test_versions_of_many_cells(one: Map, monkeypatch: pytest.MonkeyPatch) -> No
     cost = sum(layer_versions.HALO_COST if layer in FAR else 1 for layer in layers)
     for at_once in (1, 5, 16, 100):
         versions = LayerVersions(lambda: one.catalogue)
-        monkeypatch.setattr(layer_versions, "COMPUTED_AT_ONCE", at_once * cost)
+        monkeypatch.setattr(layer_versions, "COMPUTED_PER_BATCH", at_once * cost)
         for known in range(at_once, 16 + at_once, at_once):
             found, count, complete = versions.of_cells(cells, layers)
             assert (count, complete) == (min(known, 16), known >= 16)

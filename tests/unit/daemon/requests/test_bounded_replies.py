@@ -188,7 +188,7 @@ def test_a_request_that_waits_is_found_again_in_the_map_as_it_is_then(
 
 @pytest.mark.parametrize("again", [1, 3, 9])
 def test_cells_that_are_evicted_each_time(inner: Inner, small_map: DividedMap, again: int) -> None:
-    """A request waits for them again, but not for ever."""
+    """A request waits for them again, but not without bound."""
     one = inner(small_map.root)
     one.hold_answers = True
     one.ask(one.session(), Selected(1, ("0_0.pcd", "20_20.pcd"), wait=LONG_S))

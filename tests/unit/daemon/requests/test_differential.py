@@ -276,7 +276,7 @@ def test_versions_that_take_long_are_found_some_at_a_time(
     area, versions = np.arange(16), [cache.layers.version(index, "denoise") for index in range(16)]
     message = Differential(1, EVERYWHERE, packed=pack_versions([*versions[1:], 77]))
     cache.layers.forget()
-    monkeypatch.setattr(layer_versions, "COMPUTED_AT_ONCE", 3 * layer_versions.HALO_COST)
+    monkeypatch.setattr(layer_versions, "COMPUTED_PER_BATCH", 3 * layer_versions.HALO_COST)
     first = difference(cache, message, area, layers)
     assert (first.cells, first.looked_at, first.removed_packed) == ([(0, "denoise")], 3, b"")
     start = first.looked_at

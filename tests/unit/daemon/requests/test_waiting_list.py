@@ -12,7 +12,7 @@ from shmmap.daemon.requests.waiting_list import (
     MAX_OF_A_SESSION,
     MAX_WEIGHT,
     MAX_WEIGHT_OF_A_PROCESS,
-    TAKEN_AT_ONCE,
+    TAKEN_PER_TURN,
     CellRequest,
     WaitingList,
 )
@@ -82,14 +82,14 @@ def test_what_a_request_names_as_held_weighs() -> None:
 
 def test_many_that_are_overdue_are_taken_some_at_a_time() -> None:
     waiting = WaitingList(Ledger(0))
-    for owner in sessions(2 * TAKEN_AT_ONCE // MAX_OF_A_SESSION):
+    for owner in sessions(2 * TAKEN_PER_TURN // MAX_OF_A_SESSION):
         for number in range(MAX_OF_A_SESSION):
             add(waiting, waiting_request(owner, float(number)))
     taken: list[CellRequest] = []
     while part := waiting.take(1e9):
-        assert len(part) == TAKEN_AT_ONCE
+        assert len(part) == TAKEN_PER_TURN
         taken += part
-    assert len(set(map(id, taken))) == len(waiting) == 2 * TAKEN_AT_ONCE
+    assert len(set(map(id, taken))) == len(waiting) == 2 * TAKEN_PER_TURN
 
 
 def test_it_is_due_when_nothing_is_left_to_wait_for() -> None:
