@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 
 import shmmap
-from shmmap.client import connection
 from shmmap.client.window import follower
 from shmmap.errors import BadRequest, LoadTimeout, NoAnswer, UnknownCell
 from tests.process.conftest import COLD
@@ -173,21 +172,6 @@ def test_a_caller_that_is_interrupted_leaves_no_place(one: DaemonProcess, client
         assert all(future.result(LONG_S).complete for future in more)
     finally:
         signal.signal(signal.SIGUSR1, before)
-
-
-def test_a_daemon_that_knows_no_cancel(
-    one: DaemonProcess, client: shmmap.Client, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """One of 2.0: places stay taken until the waits are over, and all else goes on."""
-    monkeypatch.setattr(connection, "_CANCEL_MINOR", 99)
-    with shmmap.connect(one.endpoint, timeout=LONG_S) as client, standing_still(one):
-        waiting = [client.futures.around(*COLD, wait=LONG_S) for _ in range(64)]
-        until(lambda: len(table_of(client)._waiting) == 64)  # one that was not sent takes no place
-        for future in waiting:
-            assert future.cancel()
-        until(lambda: not table_of(client).is_busy)
-        assert client.around(0, 0, 5).complete
-        assert client.around(*COLD, wait=LONG_S, strict=None).pending, "no place is left"
 
 
 def test_callbacks(client: shmmap.Client) -> None:
