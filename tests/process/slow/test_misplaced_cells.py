@@ -14,7 +14,7 @@ import shmmap
 from shmmap import ShmmapWarning
 from tests.process.conftest import DaemonFactory
 from tests.support.command_line import Shmmap, Verbs, doctor, verb
-from tests.support.daemon_process import DaemonProcess
+from tests.support.daemon_process import DaemonProcess, until
 from tests.support.divided_map import DividedMap, random_points
 
 MOVED = "0_0.pcd"
@@ -72,7 +72,7 @@ def test_moved_cells_are_named_everywhere(
         client.reload()
         client.around(0, 0, 30)
         assert count(client) == 0
-    assert finding(one)["state"] == "ok"
+    until(lambda: finding(one)["state"] == "ok")  # the statistics segment follows with the next beat
 
 
 def test_known_after_a_warm_restart_and_gone_with_the_cell(
