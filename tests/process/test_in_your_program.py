@@ -21,6 +21,7 @@ from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import ROOT, DaemonProcess
 from tests.support.divided_map import DividedMap
 from tests.support.pages import read_page
+from tests.support.skips import open3d_or_skip
 
 PAGE = read_page("clients/IN_YOUR_PROGRAM.md")
 EXAMPLES = ROOT / "clients/examples"
@@ -79,7 +80,7 @@ def test_lines_for_a_library(standing: DaemonProcess, tmp_path: Path, name: str)
 
 def test_clouds_for_the_window_of_open3d(standing: DaemonProcess, tmp_path: Path) -> None:
     """Everything but the window itself, which needs a display."""
-    pytest.importorskip("open3d", reason="open3d is not installed")
+    open3d_or_skip()
     *clouds, window = PAGE.blocks["open3d"]
     assert window == "o3d.visualization.draw_geometries(clouds)"
     check = [

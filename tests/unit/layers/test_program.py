@@ -18,6 +18,7 @@ from shmmap.layers.reference import column_rows, column_table
 from shmmap.layers.spec import kinds, parse_layer
 from shmmap.testing.layer_conformance import surface
 from tests.support.divided_map import random_points, write_pcd
+from tests.support.skips import open3d_or_skip
 
 DOCUMENT = (Path(shmmap.layers.__file__).parent / "LAYERS.md").read_text(encoding="utf-8")
 
@@ -92,6 +93,8 @@ def test_rows_say_dtype_shape_unit_frame_and_what_stands_for_no_value() -> None:
     ],
 )  # fmt: skip
 def test_declared_shapes_and_marks_of_no_value_are_those_of_a_layer(spec: str) -> None:
+    if spec in ("denoise", "normals(1)"):
+        open3d_or_skip()
     xyz = surface(np.random.default_rng(3), 400).astype(np.float32)
     xyz[:, :2] *= 3  # columns without a point between others
     xyz[0, 0] -= 30.0

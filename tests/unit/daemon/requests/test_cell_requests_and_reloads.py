@@ -23,6 +23,7 @@ from shmmap.protocol.messages import (
 )
 from tests.support.divided_map import DividedMap, random_points
 from tests.support.segment_reader import map_segment, parse
+from tests.support.skips import open3d_or_skip
 from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner, names
 
 
@@ -122,6 +123,7 @@ def test_a_map_switched_back_by_its_symlink(inner: Inner, small_map: DividedMap,
 @pytest.mark.parametrize("what", ["rewritten", "moved", "removed", "all"])
 def test_a_reload_checks_the_segments_of_what_changed(inner: Inner, small_map: DividedMap, what: str) -> None:
     """Segments are warm exactly if they are current, also where a layer reads the cells around."""
+    open3d_or_skip()
     layers = ("points", "denoise(neighbors=5,halo=1.0)")
     one = inner(small_map.root)
     everything = Area(1, EVERYWHERE, layers, wait=600.0)
