@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
@@ -104,9 +105,13 @@ class Room:
 
     def still_waited_for(self, running: int, now_s: float) -> bool:
         """Whether nothing has changed since a load began to wait; otherwise it should try again."""
-        until_s = min(self._waited_until_s, self.evictor.wake_s)
-        self.waited_for = now_s < until_s and self._waited_at == self._state(running)
+        self.waited_for = now_s < self._waited_until_s and self._waited_at == self._state(running)
         return self.waited_for
+
+    def wake(self, now_s: float) -> None:
+        """Let the next load try again when it is time to; that time is over then, even if none waits."""
+        if self.evictor.wake_s <= now_s:
+            self.evictor.wake_s, self.waited_for = math.inf, False
 
     def _state(self, running: int) -> tuple[int, ...]:
         """Return a value that differs whenever memory may be free, or another load is next."""

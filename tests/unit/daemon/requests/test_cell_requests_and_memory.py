@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from shmmap.daemon.cache import holders
+from shmmap.daemon.cache.eviction_plan import HAND_OUT_GRACE_S
 from shmmap.daemon.cache.evictor import Freeing
 from shmmap.daemon.cache.holders import Holders
 from shmmap.daemon.loading.room import AHEAD_SHARE, Room
@@ -187,6 +188,26 @@ def test_the_end_of_a_loader_that_waits_for_room(inner: Inner, small_map: Divide
     one.run_until(lambda: not one.ledger.reserved_bytes)
     assert one.scheduler.room.awaiting_grant == {}
     assert worker not in list(one.pool)
+
+
+def test_the_loop_sleeps_once_no_load_waits_for_the_end_of_a_grace(
+    inner: Inner, small_map: DividedMap
+) -> None:
+    each = sizes(small_map, inner)
+    one = inner(small_map.root)
+    one.ledger.budget_bytes = one.ledger.overhead_bytes + 5 * each
+    one.stop_clock()  # the cells handed out first stay in their grace
+    assert len(one.cells_for(Area(1, CircleMessage(0, 0, 5), wait=30.0)).cells) == 4
+    one.ask(one.session(), Selected(2, ("20_20.pcd",), wait=900.0))
+    one.run_until(lambda: one.now_s() < one.scheduler.next_event_s() <= one.now_s() + HAND_OUT_GRACE_S)
+    small_map.remove_cell("20_20.pcd")
+    small_map.write_metadata()
+    one.reload()
+    one.turn()
+    assert not len(one.loads)
+    one.offset_s += HAND_OUT_GRACE_S
+    one.turn()
+    assert one.scheduler.next_event_s() > one.now_s()
 
 
 def test_duplicates_count_once_for_the_quota(inner: Inner, small_map: DividedMap) -> None:
