@@ -381,7 +381,7 @@ class CellCache:
 
     def reclaim(self, now_s: float) -> bool:
         """Free some retired segments that are due, check for lost ones; return whether more may fit now."""
-        freed = bool(self.ledger.retired) and self.reclaimer.sweep(now_s) > 0
+        freed = bool(self.reclaimer.due) and self.reclaimer.sweep(now_s) > 0
         return (not self.lost.to_check.is_done and self.lost.check_some(now_s)) or freed
 
     def next_reclaim_s(self) -> float:

@@ -134,6 +134,8 @@ class Reclaimer:
     ----------
     closer
         Closes descriptors whose closing takes long.
+    due
+        Heap of checks, by time; also of segments that are gone or were rescheduled, until their time comes.
     """
 
     ledger: Ledger
@@ -142,8 +144,8 @@ class Reclaimer:
     pins: PinWatch
     observer: RetirementObserver
     closer: Closer = field(default_factory=Closer)
+    due: list[tuple[float, int, Retired]] = field(default_factory=list)
     _by_key: dict[Key, Retired] = field(default_factory=dict)
-    _due: list[tuple[float, int, Retired]] = field(default_factory=list)
     _number: int = 0
     _to_check: Walk[Resident] = field(default_factory=Walk)
 
@@ -222,7 +224,7 @@ class Reclaimer:
         """Schedule a check of a retired segment."""
         retired.probe_after_s = when_s = max(when_s, retired.tick_over_s)
         self._number += 1
-        heapq.heappush(self._due, (when_s, self._number, retired))
+        heapq.heappush(self.due, (when_s, self._number, retired))
 
     def retired_of(self, key: Key) -> Resident | None:
         """Return the segment of a key that was retired last, while it exists."""
@@ -291,7 +293,7 @@ class Reclaimer:
             if retired is None:
                 break
             freed += self._probe(retired, now_s)  # if that fails, it is still due
-            heapq.heappop(self._due)
+            heapq.heappop(self.due)
         if not self._to_check.is_done:
             for resident in self._to_check.for_a_turn():
                 retired = self.ledger.retired.get(resident.name)
@@ -308,16 +310,16 @@ class Reclaimer:
         for _ in range(DROPPED_PER_LOOK):
             if self.next_sweep_s() > now_s:
                 break
-            when_s, _, retired = self._due[0]
+            when_s, _, retired = self.due[0]
             known = self.ledger.retired.get(retired.resident.name)
             if known is retired and when_s == retired.probe_after_s:
                 return retired
-            heapq.heappop(self._due)
+            heapq.heappop(self.due)
         return None
 
     def next_sweep_s(self) -> float:
         """Return when the next check of a segment is due at the earliest; infinity if there is none."""
-        return self._due[0][0] if self._due else math.inf
+        return self.due[0][0] if self.due else math.inf
 
     def release(self, residents: Iterable[Resident], now_s: float) -> None:
         """Schedule a check of segments that a client has dropped: those without other users are freed."""

@@ -108,10 +108,9 @@ class Room:
         self.waited_for = now_s < self._waited_until_s and self._waited_at == self._state(running)
         return self.waited_for
 
-    def wake(self, now_s: float) -> None:
-        """Let the next load try again when it is time to; that time is over then, even if none waits."""
-        if self.evictor.wake_s <= now_s:
-            self.evictor.wake_s, self.waited_for = math.inf, False
+    def wake(self) -> None:
+        """Let the next load try again: it is time to.  That time is over then, even if none waits."""
+        self.evictor.wake_s, self.waited_for = math.inf, False
 
     def _state(self, running: int) -> tuple[int, ...]:
         """Return a value that differs whenever memory may be free, or another load is next."""

@@ -307,7 +307,8 @@ class Scheduler:
 
     def pump(self, now_s: float) -> None:
         """Give a queued load to a worker if memory and workers allow it; see `unfinished`."""
-        self.room.wake(now_s)
+        if self._cache.evictor.wake_s <= now_s:
+            self.room.wake()
         if self.room.awaiting_grant:
             self.room.grant(self._jobs, now_s)
         self._drop_some()

@@ -297,10 +297,15 @@ class InnerDaemon:
         self.cache.events.flush()
         return new
 
+    def sleeps(self) -> bool:
+        """Whether the loop has nothing to do for loads and memory until something arrives or time passes."""
+        return self.scheduler.next_event_s() > self.now_s()
+
     def close(self) -> None:
-        """End everything and remove the directory."""
+        """End everything and remove the directory; the loop comes to rest before, whatever a test did."""
         for session in list(self.sessions):
             self.sessions.close(session)
+        self.run_until(self.sleeps)
         self.memory.close(keep=True)
         self.directory.close()
         shutil.rmtree(self.shm_dir)
