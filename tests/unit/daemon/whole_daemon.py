@@ -116,10 +116,11 @@ class WholeDaemon:
         return decode_reply(self._client.recv())
 
     def close(self, *, keep: bool = False) -> None:
-        """End it once; ``keep`` leaves the segments to the next run."""
+        """End it once, when the loop has come to rest; ``keep`` leaves the segments to the next run."""
         if self._client.closed:
             return
         self._client.close()
+        self.turn_until(lambda: self.service._loop._poll_timeout_s() > 0)
         self._context.term()
         self.service._end()
         self.memory.close(keep=keep)
