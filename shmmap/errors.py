@@ -163,9 +163,14 @@ class MapDataError(ShmmapError):
     exit_code = 65
 
     def __init__(
-        self, message: str, *, path: str = "", offset: int | None = None, cause: str = "bad_data",
+        self,
+        message: str,
+        *,
+        path: str = "",
+        offset: int | None = None,
+        cause: str = "bad_data",
         hint: str = "",
-    ) -> None:  # fmt: skip
+    ) -> None:
         place = f" (at byte {offset})" if offset is not None else ""
         super().__init__(f"{path}: {message}{place}" if path else message + place, hint=hint)
         self.path = path
@@ -311,9 +316,15 @@ class CellError(ShmmapError):
     exit_code = 1
 
     def __init__(
-        self, message: str, *, cell_id: str = "", layer: str = "", holders: Sequence[Holder] = (),
-        box: tuple[float, float, float, float] | None = None, hint: str = "",
-    ) -> None:  # fmt: skip
+        self,
+        message: str,
+        *,
+        cell_id: str = "",
+        layer: str = "",
+        holders: Sequence[Holder] = (),
+        box: tuple[float, float, float, float] | None = None,
+        hint: str = "",
+    ) -> None:
         super().__init__(message, hint=hint)
         self.cell_id = cell_id
         self.layer = layer

@@ -188,9 +188,11 @@ def _not_kept(error: Exception) -> None:
     _unkept.append(str(error))
     with contextlib.suppress(RuntimeError):
         _say(
-            "compiled kernels are not kept", path=_place(), reason=_words(error),
+            "compiled kernels are not kept",
+            path=_place(),
+            reason=_words(error),
             effect="each process compiles them, which takes some seconds",
-        )  # fmt: skip
+        )
 
 
 def _words(why: object) -> str:

@@ -9,9 +9,13 @@ from typing import Any, Final
 from shmmap.errors import PackageMissing, ShmmapError
 
 SYSTEM_PACKAGES: Final = (
-    "libegl1", "libgl1", "libx11-6", "libusb-1.0-0", "libgomp1",
+    "libegl1",
+    "libgl1",
+    "libx11-6",
+    "libusb-1.0-0",
+    "libgomp1",
     *(() if os.uname().machine == "x86_64" else ("libgfortran5",)),  # Open3D for other machines links to it
-)  # fmt: skip
+)
 """Packages of Debian and Ubuntu that Open3D needs on a machine without a desktop."""
 
 

@@ -5,16 +5,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from types import TracebackType
-from typing import Final, TypeVar
+from typing import Final
 
 import zmq
 
 from shmmap import BadRequest
+from shmmap_clients.closed_at_end import ClosedAtEnd
 
 _REPEAT_MS: Final = 100  # between two repetitions of the end
-
-_Self = TypeVar("_Self", bound="_Endpoint")
 
 
 def is_endpoint(text: str) -> bool:
@@ -22,20 +20,12 @@ def is_endpoint(text: str) -> bool:
     return "://" in text
 
 
-class _Endpoint:
+class _Endpoint(ClosedAtEnd):
     """A socket of its own kind, in a context of its own."""
 
     def __init__(self, kind: int) -> None:
         self._context = zmq.Context()
         self._socket: zmq.Socket[bytes] = self._context.socket(kind)
-
-    def __enter__(self: _Self) -> _Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Close the socket."""

@@ -42,11 +42,16 @@ def touched_bricks(index: Any, words: Any, touched: Any) -> Any:
 
 @compiled(
     types.void(
-        uint16[::1], int16[::1], read_only(uint16, 1), read_only(uint64, 1), int64, read_only(int64, 1),
+        uint16[::1],
+        int16[::1],
+        read_only(uint16, 1),
+        read_only(uint64, 1),
+        int64,
+        read_only(int64, 1),
         int64[::1],
     ),
     brief=True,
-)  # fmt: skip
+)
 def add_evidence(index: Any, cells: Any, words: Any, bits: Any, hits: Any, limits: Any, counts: Any) -> None:
     """Add the evidence of one scan to a chunk; ``cells`` has room for the bricks that become known.
 

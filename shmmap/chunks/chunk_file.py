@@ -148,10 +148,23 @@ def encode_chunk(view: ChunkView, codec: str = "zlib") -> bytes:
     )
     stored = _compressor(number)(body)
     header = _HEADER.pack(
-        _MAGIC, *CHUNK_FILE_VERSION, _ORDER, identity.map_id, *identity.key, number, int(state["version"]),
-        len(body), len(stored), xxh3_64_intdigest(stored), int(state["active"]), int(state["occupied"]),
-        int(state["free"]), bricks, int(state["changed_ns"]), identity.resolution,
-    )  # fmt: skip
+        _MAGIC,
+        *CHUNK_FILE_VERSION,
+        _ORDER,
+        identity.map_id,
+        *identity.key,
+        number,
+        int(state["version"]),
+        len(body),
+        len(stored),
+        xxh3_64_intdigest(stored),
+        int(state["active"]),
+        int(state["occupied"]),
+        int(state["free"]),
+        bricks,
+        int(state["changed_ns"]),
+        identity.resolution,
+    )
     return b"".join((header, _CRC.pack(zlib.crc32(header), 0), stored))
 
 
@@ -168,9 +181,26 @@ def read_file_header(data: bytes | memoryview, path: str = "") -> ChunkFileHeade
             f"{len(data)} bytes are too few for the header of a chunk's file", path=path, cause="truncated"
         )
     (
-        magic, major, minor, order, map_id, x, y, z, codec, version, raw, stored, body_hash, active, occupied,
-        free, bricks, changed_ns, resolution,
-    ) = _HEADER.unpack_from(data)  # fmt: skip
+        magic,
+        major,
+        minor,
+        order,
+        map_id,
+        x,
+        y,
+        z,
+        codec,
+        version,
+        raw,
+        stored,
+        body_hash,
+        active,
+        occupied,
+        free,
+        bricks,
+        changed_ns,
+        resolution,
+    ) = _HEADER.unpack_from(data)
     if magic != _MAGIC or order != _ORDER:
         raise MapDataError("no chunk's file", path=path, offset=0)
     if major != CHUNK_FILE_VERSION[0]:
@@ -206,8 +236,10 @@ def check_file(data: bytes, path: str = "") -> ChunkFileHeader:
     if len(stored) != header.stored_bytes:
         raise MapDataError(
             f"{len(stored)} bytes of body where there should be {header.stored_bytes}",
-            path=path, offset=FILE_HEADER_BYTES, cause="truncated",
-        )  # fmt: skip
+            path=path,
+            offset=FILE_HEADER_BYTES,
+            cause="truncated",
+        )
     if xxh3_64_intdigest(stored) != header.body_hash:
         raise MapDataError("the body's checksum is wrong", path=path, offset=FILE_HEADER_BYTES)
     return header
@@ -225,8 +257,10 @@ def check_identity(header: ChunkFileHeader, identity: ChunkIdentity, path: str =
         raise MapDataError(
             f"it is chunk {header.key.text} of map {header.map_id.hex()}, not {identity.key.text} of"
             f" {identity.map_id.hex()}",
-            path=path, offset=16, cause="another_chunk",
-        )  # fmt: skip
+            path=path,
+            offset=16,
+            cause="another_chunk",
+        )
     if header.resolution != identity.resolution:
         raise MapDataError(
             f"its voxels are {header.resolution} m a side, not {identity.resolution} m", path=path, offset=104

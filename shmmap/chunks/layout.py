@@ -46,17 +46,33 @@ INDEX_AT: Final = 2048
 STATE: Final = np.dtype(
     {
         "names": [
-            "sequence", "version", "saved_version", "state", "bricks", "active", "occupied", "free",
-            "changed_ns", "mappers",
+            "sequence",
+            "version",
+            "saved_version",
+            "state",
+            "bricks",
+            "active",
+            "occupied",
+            "free",
+            "changed_ns",
+            "mappers",
         ],
         "formats": [
-            "<u8", "<u8", "<u8", "<u4", "<u4", "<u4", "<u4", "<u4", "<u8",
+            "<u8",
+            "<u8",
+            "<u8",
+            "<u4",
+            "<u4",
+            "<u4",
+            "<u4",
+            "<u4",
+            "<u8",
             ([("number", "<u4"), ("reserved", "<u4"), ("scan", "<u8")], (MAPPERS,)),
         ],
         "offsets": [0, 8, 16, 24, 28, 32, 36, 40, 48, 128],
         "itemsize": 640,
     }
-)  # fmt: skip
+)
 """The part of the header that changes, from byte 128 on."""
 
 
@@ -104,10 +120,22 @@ def new_header(identity: ChunkIdentity) -> bytearray:
         raise ValueError(f"frame {identity.frame_id!r} or map number does not fit a chunk's header")
     page = bytearray(HEADER_BYTES)
     _CONSTANT.pack_into(
-        page, 0, MAGIC, *CHUNKS_VERSION, BYTE_ORDER, identity.map_id, *identity.key, CHUNK_SIDE,
-        identity.resolution, identity.clamp_min, identity.clamp_max, identity.occupied_above,
-        identity.free_below, identity.generation, frame,
-    )  # fmt: skip
+        page,
+        0,
+        MAGIC,
+        *CHUNKS_VERSION,
+        BYTE_ORDER,
+        identity.map_id,
+        *identity.key,
+        CHUNK_SIDE,
+        identity.resolution,
+        identity.clamp_min,
+        identity.clamp_max,
+        identity.occupied_above,
+        identity.free_below,
+        identity.generation,
+        frame,
+    )
     _CRC.pack_into(page, _CONSTANT.size, zlib.crc32(page[: _CONSTANT.size]), 0)
     return page
 
@@ -130,9 +158,23 @@ def read_identity(page: bytes | bytearray | memoryview, name: str = "chunk") -> 
     if len(page) < STATE_AT:
         raise SegmentCorrupt(f"{name}: {len(page)} bytes are too few for the header of a chunk")
     (
-        magic, major, minor, order, map_id, x, y, z, side, resolution, clamp_min, clamp_max, occupied_above,
-        free_below, generation, frame,
-    ) = _CONSTANT.unpack_from(page)  # fmt: skip
+        magic,
+        major,
+        minor,
+        order,
+        map_id,
+        x,
+        y,
+        z,
+        side,
+        resolution,
+        clamp_min,
+        clamp_max,
+        occupied_above,
+        free_below,
+        generation,
+        frame,
+    ) = _CONSTANT.unpack_from(page)
     if magic != MAGIC:
         raise SegmentCorrupt(f"{name}: no chunk: it starts with {magic!r}")
     if order != BYTE_ORDER:

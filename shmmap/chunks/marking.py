@@ -112,9 +112,12 @@ class Marker:
         return self._collect(corner), counts
 
     def _try(
-        self, points: NDArray[np.floating], pose: NDArray[np.float64], corner: NDArray[np.int64],
+        self,
+        points: NDArray[np.floating],
+        pose: NDArray[np.float64],
+        corner: NDArray[np.int64],
         sensor: NDArray[np.int64],
-    ) -> ScanCounts | None:  # fmt: skip
+    ) -> ScanCounts | None:
         """Mark a scan; return None if there are too few slots."""
         wanted, counts = self.filter, np.zeros(5, np.int64)
         limits = np.array(

@@ -86,17 +86,36 @@ def _place_points(
 @compiled(
     *(
         types.int64(
-            read_only(real, 2), read_only(float64, 2), read_only(float64, 1), read_only(int64, 1),
-            read_only(uint64, 2), int32[::1], int32[::1], int64, uint64[::1], uint64[::1], int32[:, ::1],
+            read_only(real, 2),
+            read_only(float64, 2),
+            read_only(float64, 1),
+            read_only(int64, 1),
+            read_only(uint64, 2),
+            int32[::1],
+            int32[::1],
+            int64,
+            uint64[::1],
+            uint64[::1],
+            int32[:, ::1],
             int64[::1],
         )
         for real in (float32, float64)
     )
-)  # fmt: skip
+)
 def mark_ends(
-    points: Any, pose: Any, limits: Any, corner: Any, codes: Any, table: Any, used: Any, most: Any, hits: Any,
-    misses: Any, ends: Any, counts: Any,
-) -> Any:  # fmt: skip
+    points: Any,
+    pose: Any,
+    limits: Any,
+    corner: Any,
+    codes: Any,
+    table: Any,
+    used: Any,
+    most: Any,
+    hits: Any,
+    misses: Any,
+    ends: Any,
+    counts: Any,
+) -> Any:
     """Mark the ends of rays, first those in range, then those that are cut; each voxel once.
 
     Parameters
@@ -156,14 +175,30 @@ def mark_ends(
 
 @compiled(
     types.boolean(
-        read_only(int32, 2), int64, int64, int64, int64, read_only(uint64, 2), int32[::1], int32[::1], int64,
+        read_only(int32, 2),
+        int64,
+        int64,
+        int64,
+        int64,
+        read_only(uint64, 2),
+        int32[::1],
+        int32[::1],
+        int64,
         uint64[::1],
     )
-)  # fmt: skip
+)
 def mark_rays(
-    ends: Any, count: Any, from_x: Any, from_y: Any, from_z: Any, codes: Any, table: Any, used: Any,
-    most: Any, misses: Any,
-) -> Any:  # fmt: skip
+    ends: Any,
+    count: Any,
+    from_x: Any,
+    from_y: Any,
+    from_z: Any,
+    codes: Any,
+    table: Any,
+    used: Any,
+    most: Any,
+    misses: Any,
+) -> Any:
     """Mark the voxels from the sensor's voxel, included, to the ends, excluded.
 
     The traversal is Bonxai's ``RayIterator``: one voxel per step along the longest axis, u.  Positions along

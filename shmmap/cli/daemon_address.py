@@ -238,6 +238,9 @@ def _connected(args: argparse.Namespace, path: str | None, name: str) -> Client:
 
     timeout_s = ANSWER_S if args.timeout is None else args.timeout
     return shmmap.connect(
-        path, timeout=timeout_s, connect_timeout=timeout_s, name=name,
+        path,
+        timeout=timeout_s,
+        connect_timeout=timeout_s,
+        name=name,
         shm_dir=_setting(args, "shm_dir") or None,
-    )  # fmt: skip
+    )

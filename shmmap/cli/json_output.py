@@ -19,9 +19,6 @@ Box: TypeAlias = Annotated[
     tuple[float, float, float, float],
     msgspec.Meta(description="min x, min y, max x, max y: metres, map frame"),
 ]
-Fields: TypeAlias = Annotated[
-    list[tuple[str, str]], msgspec.Meta(description="name and numpy's dtype of each field")
-]
 
 
 def hexed(number: int) -> str:

@@ -327,7 +327,7 @@ class Service:
         if was_noticed() and not self.replaced:
             self._on_replaced()
         self._restore_sockets(now_s)
-        if self._file_watch is not None and self._file_watch.due(now_s):
+        if self._file_watch is not None and self._file_watch.take_change(now_s):
             self._reload()
         if self._elsewhere is not None:
             self._elsewhere.note_served(memory.cache.catalogue)

@@ -42,7 +42,7 @@ from shmmap.daemon.live_relay import LiveEvents, LiveRelay, NoLiveMaps
 from shmmap.daemon.loading.prepared_parent import fork_early
 from shmmap.daemon.map.catalogue_reload import Reloader
 from shmmap.daemon.map.catalogue_view import ViewOrigin
-from shmmap.daemon.map_in_memory import FetchedFrom, MapInMemory, place_live_maps
+from shmmap.daemon.map_in_memory import FROM_FILES, FetchedFrom, MapInMemory, place_live_maps
 from shmmap.daemon.prerequisites import (
     access_of_segments,
     check_file_size_limit,
@@ -54,8 +54,8 @@ from shmmap.daemon.prerequisites import (
 from shmmap.daemon.requests.operators.operator_requests import Authorization
 from shmmap.daemon.service_manager import (
     ActivatedSocket,
-    MoreTime,
     ServiceManager,
+    asking_for_time,
     notify,
     take_activated_socket,
 )
@@ -155,12 +155,12 @@ def run(config: DaemonConfig) -> int:
             step("daemon.lock")
             stack.push(partial(stopped_early, signals, directory, config.instance))
         started_s = time.monotonic()
-        with MoreTime(notify, "reading the map"):
+        with asking_for_time(notify, "reading the map"):
             catalogue = origin.load()
         for problem in catalogue.problems:
             log.warning("problem in the map", what=problem)
         with signals.held():
-            fetched = _fetched_from(elsewhere, config) if elsewhere is not None else None
+            fetched = _fetched_from(elsewhere, config) if elsewhere is not None else FROM_FILES
             memory = MapInMemory(config, catalogue, directory, pins, path, mode, gid, early, fetched)
             stack.push(partial(_close, memory, signals))
         ledger = memory.cache.ledger

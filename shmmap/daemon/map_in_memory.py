@@ -189,7 +189,7 @@ def _without_huge_pages(path: str) -> str:
 
 
 class FetchedFrom(NamedTuple):
-    """How loaders fetch cells.
+    """How loaders fetch cells; by default cells are files.
 
     Attributes
     ----------
@@ -197,14 +197,20 @@ class FetchedFrom(NamedTuple):
         Arguments of loaders.
     places
         Number of cells that each loader fetches concurrently.
-    link, needed_bytes
-        Budget of the link, and what a job fetches over it; None where the map is in a directory.
+    link
+        Budget of the link; None where the map is in a directory.
+    needed_bytes
+        What a job fetches over the link.
     """
 
-    words: tuple[str, ...]
-    places: int
-    link: Link | None
-    needed_bytes: Callable[[Job], int]
+    words: tuple[str, ...] = ()
+    places: int = 1
+    link: Link | None = None
+    needed_bytes: Callable[[Job], int] | None = None
+
+
+FROM_FILES: Final = FetchedFrom()
+"""How loaders get cells that are files."""
 
 
 class MapInMemory:
@@ -238,7 +244,7 @@ class MapInMemory:
         mode: int,
         gid: int,
         early: Early | None = None,
-        origin: FetchedFrom | None = None,
+        fetched: FetchedFrom = FROM_FILES,
         *,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -301,7 +307,7 @@ class MapInMemory:
                 str(loader_bytes(group_limit)),
                 config.cache_dir,
                 str(config.cache_bytes),
-                *(origin.words if origin is not None else ()),
+                *fetched.words,
             )
             parent = PreparedParent(settings, self.watched, early)
             parent.start()  # its imports run while this process continues to start
@@ -315,14 +321,14 @@ class MapInMemory:
                     limit=config.loaders(),
                     deadline_s=config.load_timeout_s,
                     on_message=on_message,
-                    places=origin.places if origin is not None else 1,
+                    places=fetched.places,
                 ),
                 self.waiting,
                 clock=clock,
                 prefetch_share=config.prefetch_share,
                 outage_tolerance_s=config.outage_tolerance_s,
-                link=origin.link if origin is not None else None,
-                needed_bytes=origin.needed_bytes if origin is not None else None,
+                link=fetched.link,
+                needed_bytes=fetched.needed_bytes,
             )
             self.preparer = _preparer(config, self.cache, self.scheduler, pool, clock)
             self.adoption = Adoption(self.cache, self.scheduler.loads, self.scheduler.misplaced)

@@ -8,6 +8,7 @@ and READY=1 at the end.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import re
@@ -16,8 +17,7 @@ import socket
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, MutableMapping
-from types import TracebackType
+from collections.abc import Callable, Iterator, Mapping, MutableMapping
 from typing import Final, NamedTuple
 
 from shmmap.errors import ConfigError
@@ -156,8 +156,9 @@ MAX_START_S: Final = 3600.0
 """Limit of a start: a longer one counts as hanging, and another start may help."""
 
 
-class MoreTime:
-    """Context manager: during its ``with`` block, a thread asks the service manager for more time.
+@contextlib.contextmanager
+def asking_for_time(send: Callable[..., bool], what: str, every_s: float = EXTEND_EVERY_S) -> Iterator[None]:
+    """Have a thread ask the service manager for more time during the ``with`` block.
 
     systemd ends a service that is not ready after ``TimeoutStartSec``, and starts it again.  A daemon that
     checks the files of ten million cells, which takes minutes, would never be ready.  ``EXTEND_TIMEOUT_USEC``
@@ -172,32 +173,24 @@ class MoreTime:
     every_s
         Interval of the requests, seconds.
     """
+    over = threading.Event()
 
-    def __init__(self, send: Callable[..., bool], what: str, every_s: float = EXTEND_EVERY_S) -> None:
-        self._send = send
-        self._what = what
-        self._every_s = every_s
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._ask, name="more time", daemon=True)
-
-    def __enter__(self) -> MoreTime:
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
-        try:
-            self._thread.start()  # signals are for the thread that reads the map: a stop must interrupt it
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._over.set()
-        self._thread.join()
-
-    def _ask(self) -> None:
+    def ask() -> None:
         end_s = time.monotonic() + MAX_START_S
-        while not self._over.wait(self._every_s) and time.monotonic() < end_s:
-            self._send(f"STATUS={self._what}", f"EXTEND_TIMEOUT_USEC={int(EXTEND_S * 1e6)}")
+        while not over.wait(every_s) and time.monotonic() < end_s:
+            send(f"STATUS={what}", f"EXTEND_TIMEOUT_USEC={int(EXTEND_S * 1e6)}")
+
+    thread = threading.Thread(target=ask, name="more time", daemon=True)
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
+    try:
+        thread.start()  # signals are for the thread that reads the map: a stop must interrupt it
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
 
 
 FIRST_FD: Final = 3  # SD_LISTEN_FDS_START

@@ -74,7 +74,7 @@ _OF_A_DAEMON: Final = frozenset({"reload", "signature", "cells", "cache size", "
 _OF_A_PUBLISHED_MAP: Final = frozenset({"link", "credentials", "clock", "versions"})
 
 
-def examine(config: DaemonConfig, file: str, machine: Machine | None = None) -> Diagnosis:
+def examine(config: DaemonConfig, file: str) -> Diagnosis:
     """Collect facts about the machine and the instance's daemon."""
     if config.shm_dir == DEFAULT_SHM_DIR:
         config = dataclasses.replace(config, shm_dir=usual_directory(config.instance))
@@ -91,7 +91,7 @@ def examine(config: DaemonConfig, file: str, machine: Machine | None = None) -> 
         path = seen.identity.endpoint
     else:
         path = _socket(config)
-    diagnosis = Diagnosis(machine or Machine(), config, file, path, seen, unreadable)
+    diagnosis = Diagnosis(Machine(), config, file, path, seen, unreadable)
     if diagnosis.alive:
         return diagnosis
     return dataclasses.replace(diagnosis, answering=answering_at(path).get(config.instance, 0))

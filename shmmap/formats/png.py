@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from shmmap.errors import BadRequest
 
 _COLOUR_TYPES: Final = {1: 0, 2: 4, 3: 2, 4: 6}  # channels: grey, grey and alpha, RGB, RGBA
-_PALETTE: Final = 3
 
 
 class PngWriter:
@@ -30,8 +29,6 @@ class PngWriter:
         1 grey, 2 grey and alpha, 3 RGB, 4 RGBA.
     bits
         8 or 16.
-    palette
-        RGB of each value, three bytes each, for an image with one channel of 8 bits; empty for a grey image.
     """
 
     def __init__(
@@ -41,7 +38,6 @@ class PngWriter:
         rows: int,
         channels: int = 1,
         bits: int = 8,
-        palette: bytes = b"",
     ) -> None:
         self._file = file
         self._left = rows
@@ -49,10 +45,8 @@ class PngWriter:
         self._dtype = np.dtype(np.uint8 if bits == 8 else ">u2")
         self._packer = zlib.compressobj(6)
         file.write(b"\x89PNG\r\n\x1a\n")
-        colour_type = _PALETTE if palette else _COLOUR_TYPES[channels]
+        colour_type = _COLOUR_TYPES[channels]
         self._chunk(b"IHDR", struct.pack(">IIBBBBB", columns, rows, bits, colour_type, 0, 0, 0))
-        if palette:
-            self._chunk(b"PLTE", palette)
 
     def add(self, rows: NDArray[np.unsignedinteger]) -> None:
         """Add rows, (n, columns) or (n, columns, channels), from top to bottom.
@@ -91,18 +85,12 @@ class PngWriter:
         )
 
 
-def png_bytes(pixels: NDArray[np.unsignedinteger], palette: bytes = b"") -> bytes:
-    """Return an image, (rows, columns) or (rows, columns, channels) uint8 or uint16, as a PNG.
-
-    Parameters
-    ----------
-    palette
-        As in `PngWriter`.
-    """
+def png_bytes(pixels: NDArray[np.unsignedinteger]) -> bytes:
+    """Return an image, (rows, columns) or (rows, columns, channels) uint8 or uint16, as a PNG."""
     channels = 1 if pixels.ndim == 2 else pixels.shape[2]
     file = io.BytesIO()
     rows, columns = pixels.shape[:2]
-    writer = PngWriter(file, columns, rows, channels, pixels.dtype.itemsize * 8, palette)
+    writer = PngWriter(file, columns, rows, channels, pixels.dtype.itemsize * 8)
     writer.add(pixels)
     writer.finish()
     return file.getvalue()

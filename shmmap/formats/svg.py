@@ -319,17 +319,14 @@ class Axes:
         self,
         title: str,
         *,
-        x_labels: Iterable[tuple[float, str]] = (),
         y_labels: Iterable[tuple[float, str]] = (),
     ) -> None:
-        """Draw a chart's title, baseline, and labels of values below and to the left of the chart."""
+        """Draw a chart's title, baseline, and labels of values to the left of the chart."""
         small: dict[str, Attribute] = {"font_size": 12, "fill": PALE}
         self.page.text(self.left, self.top - 9, title, **small)
         self.page.add(
             "path", d=f"M{_number(self.left)} {_number(self.bottom)}h{_number(self.width)}", stroke=_RULE
         )
-        for value, text in x_labels:
-            self.page.text(self.place(value, 0)[0], self.bottom + 17, text, text_anchor="middle", **small)
         for value, text in y_labels:
             self.page.text(self.left - 7, self.place(0, value)[1] + 4, text, text_anchor="end", **small)
 

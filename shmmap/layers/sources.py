@@ -9,6 +9,7 @@ works on; the deadline of a job counts from that report.
 from __future__ import annotations
 
 import os
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple, Protocol
@@ -162,28 +163,33 @@ class Fetcher(Protocol):
 
     @property
     def fd(self) -> int:
-        """File descriptor that is readable when `done` may return a job."""
+        """File descriptor that is readable when `take_done` may return a job."""
 
     def begin(self, number: int, spec: LayerSpec, job: CellJob) -> None:
         """Begin to fetch the sources of a cell's layer, without waiting."""
 
-    def done(self) -> int | None:
-        """Return the number of a job whose fetches have succeeded or failed; None if there is none."""
+    def take_done(self) -> int | None:
+        """Return the number of a job whose fetches have succeeded or failed, once; None if there is none."""
 
 
-class SourceReader(Protocol):
+class SourceReader(ABC):
     """Reads sources, which the map's origin names.
 
     A source that cannot be reached at present raises `shmmap.errors.Offline`.
+
+    Attributes
+    ----------
+    fetcher
+        Fetcher for several jobs at once; None: each job reads its sources when it runs.
     """
 
-    @property
-    def fetcher(self) -> Fetcher | None:
-        """Fetcher for several jobs at once; None: each job reads its sources when it runs."""
+    fetcher: Fetcher | None = None
 
+    @abstractmethod
     def stamp(self, source: Source) -> Stamp | None:
         """Return the present state of a source; None if it cannot be read."""
 
+    @abstractmethod
     def read(self, source: Source, box: Box, needs: Sequence[str] | None) -> CellSource:
         """Read the columns that a layer needs (None: all) of a cell's points.
 
@@ -204,21 +210,26 @@ class SourceReader(Protocol):
     ) -> SegmentHeader | None:
         """Fill an empty segment file with a layer that the source contains; None: it must be computed.
 
-        Sources always contain ``points``.  Parameters and errors are as in
-        `shmmap.layers.build.make_layer`.
+        Parameters and errors are as in `shmmap.layers.build.make_layer`.
         """
+        del spec, job, fd, reserve, warn
+        return None
 
     def named(self, message: str) -> str:
         """Return a message in which sources have the names that users know."""
+        return message
 
     def explain(self, source: Source, message: str) -> str:
         """Return a message that explains why a source could not be read, with names that users know."""
+        del source
+        return message
 
     def take_counts(self) -> tuple[int, ...]:
         """Return counts of objects read since the last call, in the order of `OBJECTS_READ`, or ()."""
+        return ()
 
 
-class Files:
+class Files(SourceReader):
     """Sources that are PCD files.
 
     Parameters
@@ -228,8 +239,6 @@ class Files:
     named
         Replaces such paths in a message by the original ones.
     """
-
-    fetcher = None
 
     def __init__(self, at: Callable[[str], str] = str, named: Callable[[str], str] = str) -> None:
         self._at, self._named = at, named
@@ -277,10 +286,6 @@ class Files:
         if place != source.name and self.stamp(source) is None and os.path.exists(source.name):
             return f"{source.name}: {REPLACED}"
         return self._named(message)
-
-    def take_counts(self) -> tuple[int, ...]:
-        """Return (), as files are not objects."""
-        return ()
 
 
 FILES: Final = Files()

@@ -6,12 +6,16 @@ from __future__ import annotations
 import os
 import sys
 import threading
+import time
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from types import TracebackType
 from typing import Final, NoReturn
 
 PREFIX: Final = "request-"
 """How the names of threads begin that make requests, or wait for them."""
+END_S: Final = 0.2
+"""How long a program that ends waits for threads that may wait for a store, seconds."""
 
 
 class RequestThreads(ThreadPoolExecutor):
@@ -25,6 +29,14 @@ class RequestThreads(ThreadPoolExecutor):
     ) -> None:
         is_interrupt = kind is not None and not issubclass(kind, Exception)
         self.shutdown(wait=not is_interrupt, cancel_futures=kind is not None)
+
+
+def have_ended(threads: Sequence[threading.Thread]) -> bool:
+    """Wait a moment for threads that are to end; return whether all have ended."""
+    until_s = time.monotonic() + END_S
+    for thread in threads:
+        thread.join(max(0.0, until_s - time.monotonic()))
+    return not any(thread.is_alive() for thread in threads)
 
 
 def leave(code: object) -> NoReturn:

@@ -106,8 +106,15 @@ LiveRequest: TypeAlias = (
     LiveList | LiveOpen | LiveScan | LiveMove | LiveSave | LiveChunks | LiveVoxels | LiveRelease
 )
 LIVE_REQUESTS: Final = (
-    LiveList, LiveOpen, LiveScan, LiveMove, LiveSave, LiveChunks, LiveVoxels, LiveRelease,
-)  # fmt: skip
+    LiveList,
+    LiveOpen,
+    LiveScan,
+    LiveMove,
+    LiveSave,
+    LiveChunks,
+    LiveVoxels,
+    LiveRelease,
+)
 
 
 class LiveListed(Message, tag="live_listed"):

@@ -23,8 +23,8 @@ from shmmap.layers.build import cache_key
 from shmmap.layers.contract import Box
 from shmmap.layers.disk_cache import LayerCache
 from shmmap.layers.points import LAYER
-from shmmap.layers.sources import CellJob, CellSource, check_size
-from shmmap.layers.spec import LayerSpec, layer_spec
+from shmmap.layers.sources import CellJob, CellSource, SourceReader, check_size
+from shmmap.layers.spec import layer_spec
 from shmmap.origin.remote.object_tier import KeptObjects, ObjectTier
 from shmmap.origin.remote.published_object import (
     ObjectName,
@@ -46,8 +46,8 @@ _OF_THE_STORE: Final = (Offline.code, MapMissing.code)
 """Errors of the store, which end the run because any other cell would fail in the same way."""
 
 
-class PublishedPoints:
-    """Reads the points of a published map's cells; see `shmmap.layers.sources.SourceReader`.
+class PublishedPoints(SourceReader):
+    """Reads the points of a published map's cells; each layer is computed.
 
     Parameters
     ----------
@@ -58,8 +58,6 @@ class PublishedPoints:
     max_bytes
         Size limit of objects held in memory.
     """
-
-    fetcher = None
 
     def __init__(self, objects: KeptObjects, threads: Executor, *, max_bytes: int = HELD_BYTES) -> None:
         self._objects = objects
@@ -98,31 +96,6 @@ class PublishedPoints:
         except MapDataError as error:
             raise LoadFailed(str(error), cell_id=source.name) from None
         return CellSource.of(header, columns, box)
-
-    def fill(
-        self,
-        spec: LayerSpec,
-        job: CellJob,
-        fd: int,
-        *,
-        reserve: Callable[[int], None] | None,
-        warn: Callable[[str], None],
-    ) -> None:
-        """Return None, as each layer is computed."""
-        del spec, job, fd, reserve, warn
-
-    def take_counts(self) -> tuple[int, ...]:
-        """Return (), as a slice's reads are not in the statistics."""
-        return ()
-
-    def named(self, message: str) -> str:
-        """Return the message unchanged, as it already names cells by their ids."""
-        return message
-
-    def explain(self, source: Source, message: str) -> str:
-        """Return the message unchanged."""
-        del source
-        return message
 
     def _frame(self, name: ObjectName) -> memoryview:
         held = self._held.get(name) or self._hold(name)

@@ -110,9 +110,18 @@ def pack_header(header: SegmentHeader) -> bytes:
             raise ValueError(f"column {column.name!r}: dtype {column.dtype} is not numeric")
         shape = (*column.shape, *(0,) * (MAX_DIMENSIONS - len(column.shape)))
         COLUMN.pack_into(
-            page, at, name, dtype, unit, len(column.shape), 0, *shape,
-            column.offset, column.nbytes, column.checksum,
-        )  # fmt: skip
+            page,
+            at,
+            name,
+            dtype,
+            unit,
+            len(column.shape),
+            0,
+            *shape,
+            column.offset,
+            column.nbytes,
+            column.checksum,
+        )
         at += COLUMN.size
     places: list[int] = []
     for text in (header.cell_id.encode(), header.layer.encode(), header.frame_id.encode()):
@@ -122,11 +131,30 @@ def pack_header(header: SegmentHeader) -> bytes:
         places += (at, len(text))
         at += len(text)
     FIXED.pack_into(
-        page, 0, MAGIC, *LAYOUT_VERSION, BYTE_ORDER, header.header_bytes, header.total_bytes,
-        header.rows, header.source_points, header.dropped_points, *header.source,
-        header.source_digest, *header.box, header.z_min, header.z_max, *header.origin,
-        header.builder_version, len(header.columns), COLUMNS_OFFSET, COLUMN.size, *places, 0, 0,
-    )  # fmt: skip
+        page,
+        0,
+        MAGIC,
+        *LAYOUT_VERSION,
+        BYTE_ORDER,
+        header.header_bytes,
+        header.total_bytes,
+        header.rows,
+        header.source_points,
+        header.dropped_points,
+        *header.source,
+        header.source_digest,
+        *header.box,
+        header.z_min,
+        header.z_max,
+        *header.origin,
+        header.builder_version,
+        len(header.columns),
+        COLUMNS_OFFSET,
+        COLUMN.size,
+        *places,
+        0,
+        0,
+    )
     if header.lattice is not None:
         leaf, first, shape_xyz = header.lattice
         LATTICE.pack_into(page, FIXED.size, *leaf, *first, *shape_xyz)
@@ -235,12 +263,41 @@ def unpack_header(page: memoryview, available_bytes: int) -> SegmentHeader:
     header_bytes, columns = read_columns(page, available_bytes)
     end = header_bytes - TAIL_BYTES
     (
-        _magic, _major, _minor, _order, _header_bytes, total_bytes,
-        rows, source_points, dropped_points, source_size, source_mtime_ns, source_ctime_ns, digest,
-        min_x, min_y, max_x, max_y, z_min, z_max, origin_x, origin_y, origin_z,
-        builder_version, _count, _columns_offset, _row_bytes,
-        id_at, id_bytes, layer_at, layer_bytes, frame_at, frame_bytes, _flags, _reserved,
-    ) = FIXED.unpack_from(page)  # fmt: skip
+        _magic,
+        _major,
+        _minor,
+        _order,
+        _header_bytes,
+        total_bytes,
+        rows,
+        source_points,
+        dropped_points,
+        source_size,
+        source_mtime_ns,
+        source_ctime_ns,
+        digest,
+        min_x,
+        min_y,
+        max_x,
+        max_y,
+        z_min,
+        z_max,
+        origin_x,
+        origin_y,
+        origin_z,
+        builder_version,
+        _count,
+        _columns_offset,
+        _row_bytes,
+        id_at,
+        id_bytes,
+        layer_at,
+        layer_bytes,
+        frame_at,
+        frame_bytes,
+        _flags,
+        _reserved,
+    ) = FIXED.unpack_from(page)
     if max(id_at + id_bytes, layer_at + layer_bytes, frame_at + frame_bytes) > end:
         raise SegmentCorrupt("a string lies outside the header")
     return SegmentHeader(

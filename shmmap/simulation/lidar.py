@@ -110,6 +110,7 @@ _CAR_GAP: Final = 18.0
 _PERSON_GAP: Final = 11.0
 _CAR_SPEED: Final = 8.0
 _PERSON_SPEED: Final = 1.3
+_OBJECT_DENSITY: Final = 600.0  # points a square metre of a car or a person
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -232,13 +233,9 @@ class Traffic:
         (N, 3) as returned by `Town.route`.
     seed
         Random seed of the traffic.
-    density
-        Points per square metre of surface.
     """
 
-    def __init__(
-        self, town: Town, route: NDArray[np.float64], *, seed: int = 0, density: float = 600.0
-    ) -> None:
+    def __init__(self, town: Town, route: NDArray[np.float64], *, seed: int = 0) -> None:
         self._town = town
         self._route = route
         steps = np.hypot(*np.diff(route[:, :2], axis=0).T)
@@ -247,8 +244,8 @@ class Traffic:
         length = float(self._along[-1])
         self._cars = _spread(rng, 2 * length, _CAR_GAP)
         self._people = _spread(rng, length, _PERSON_GAP)
-        self._car = _box(rng, _CAR, density)
-        self._person = _box(rng, _PERSON, density)
+        self._car = _box(rng, _CAR)
+        self._person = _box(rng, _PERSON)
 
     def points(self, time_s: float) -> NDArray[np.float64]:
         """Return the points of all moving objects at a time, (N, 3) float64, map frame, metres."""
@@ -284,18 +281,18 @@ def _spread(rng: np.random.Generator, length: float, gap: float) -> NDArray[np.f
     return places + rng.uniform(-0.25 * gap, 0.25 * gap, len(places))
 
 
-def _box(rng: np.random.Generator, size: tuple[float, float, float], density: float) -> NDArray[np.float64]:
+def _box(rng: np.random.Generator, size: tuple[float, float, float]) -> NDArray[np.float64]:
     """Return points on the sides and the top of a box that stands on the ground, centred at the origin."""
     length, width, height = size
     sides = ((length, 0, -width / 2), (length, 0, width / 2), (width, 1, -length / 2), (width, 1, length / 2))
     parts = []
     for side, along, offset in sides:
-        count = max(1, round(side * height * density))
+        count = max(1, round(side * height * _OBJECT_DENSITY))
         face = np.full((count, 3), offset)
         face[:, along] = rng.uniform(-side / 2, side / 2, count)
         face[:, 2] = rng.uniform(0, height, count)
         parts.append(face)
-    count = max(1, round(length * width * density))
+    count = max(1, round(length * width * _OBJECT_DENSITY))
     middle = np.array([length, width]) / 2
     top = np.column_stack([rng.uniform(-middle, middle, (count, 2)), np.full(count, height)])
     return np.concatenate([*parts, top])

@@ -58,6 +58,7 @@ Vector = tuple[float, float, float]
 
 _RANGE_NOISE_METRES = 0.015
 _WINDOW_RECESS_METRES = 0.12
+_ROOF_SHARE = 0.6  # of the density of points on other surfaces
 _WINDOW_INTENSITY = 12.0
 # glass reflects most of the laser away
 _WINDOW_RETURNS = 0.25
@@ -114,7 +115,6 @@ class Surfaces:
         windows: bool = False,
         ridge: float = 0.0,
         roof_intensity: float = 40.0,
-        roof_share: float = 0.6,
     ) -> None:
         """Add an upright box; with ``ridge`` > 0 a gable roof of that height, else a flat roof."""
         self.footprints.append((*center, *half, yaw))
@@ -140,12 +140,12 @@ class Surfaces:
         ):
             self.flat(corner, edge, upward, intensity, windows=windows)
         if ridge <= 0.0:
-            self.flat(at(-1, -1, height), long, wide, roof_intensity, share=roof_share)
+            self.flat(at(-1, -1, height), long, wide, roof_intensity, share=_ROOF_SHARE)
             return
         slope = (across[0], across[1], ridge)
         other_slope = (-across[0], -across[1], ridge)
-        self.flat(at(-1, -1, height), long, slope, roof_intensity, share=roof_share)
-        self.flat(at(1, 1, height), back_long, other_slope, roof_intensity, share=roof_share)
+        self.flat(at(-1, -1, height), long, slope, roof_intensity, share=_ROOF_SHARE)
+        self.flat(at(1, 1, height), back_long, other_slope, roof_intensity, share=_ROOF_SHARE)
         for end, edge in ((1.0, wide), (-1.0, back_wide)):
             # two right-angled halves that meet below the ridge
             half_edge: Vector = (edge[0] / 2, edge[1] / 2, 0.0)

@@ -101,9 +101,16 @@ def pack_header(header: Header) -> bytes:
     """Return the constant bytes: offsets, and descriptions of counters and histograms."""
     described = _pack_descriptions((*header.counters, *header.histograms))
     start = START.pack(
-        MAGIC, *LAYOUT_VERSION, BYTE_ORDER, DESCRIPTIONS_OFFSET, DESCRIPTION.size,
-        len(header.counters), len(header.histograms), *header[2:], 0,
-    )  # fmt: skip
+        MAGIC,
+        *LAYOUT_VERSION,
+        BYTE_ORDER,
+        DESCRIPTIONS_OFFSET,
+        DESCRIPTION.size,
+        len(header.counters),
+        len(header.histograms),
+        *header[2:],
+        0,
+    )
     return start + CRC.pack(zlib.crc32(described, zlib.crc32(start))) + described
 
 
@@ -180,9 +187,12 @@ def unpack_identity(data: bytes) -> tuple[int, bytes] | None:
 def pack_state(state: State, packer: struct.Struct) -> bytes:
     """Return one of the two state blocks; ``packer`` packs all values."""
     body = STATE.pack(
-        state.sequence, state.beat_monotonic_ns, state.beat_unix_ns,
-        len(state.values), len(state.histograms),
-    ) + packer.pack(*state.values, *state.histograms)  # fmt: skip
+        state.sequence,
+        state.beat_monotonic_ns,
+        state.beat_unix_ns,
+        len(state.values),
+        len(state.histograms),
+    ) + packer.pack(*state.values, *state.histograms)
     return body + CRC.pack(zlib.crc32(body))
 
 

@@ -474,10 +474,10 @@ def open_files() -> dict[int, str]:
     return found
 
 
-def without_settings(environ: Mapping[str, str] = os.environ) -> dict[str, str]:
+def without_settings() -> dict[str, str]:
     """Return the variables without ``SHMMAP_*`` (settings of a real daemon), but with ``SHMMAP_TEST_*``."""
     return {
         name: value
-        for name, value in environ.items()
+        for name, value in os.environ.items()
         if not name.startswith("SHMMAP_") or name.startswith("SHMMAP_TEST_")
     }

@@ -24,12 +24,16 @@ if TYPE_CHECKING:
 
 HEIGHT: Final = "height"
 """Colour by the height above the ground, which is no column."""
-MIN_SIZE: Final = (480, 320)
-"""Smallest picture, pixels: what the legend needs."""
 _DIRECTIONS: Final = {
-    "east": 0.0, "north-east": 45.0, "north": 90.0, "north-west": 135.0, "west": 180.0,
-    "south-west": 225.0, "south": 270.0, "south-east": 315.0,
-}  # fmt: skip
+    "east": 0.0,
+    "north-east": 45.0,
+    "north": 90.0,
+    "north-west": 135.0,
+    "west": 180.0,
+    "south-west": 225.0,
+    "south": 270.0,
+    "south-east": 315.0,
+}
 """Where one stands to look obliquely: angles from x to y, degrees."""
 
 _ELEVATION: Final = math.radians(38.0)
@@ -93,9 +97,11 @@ def follower_of(row: ClientRow) -> Follower | None:
     box: BoxTuple | None = None
     if window is not None:
         box = (
-            window.x - window.half_x, window.y - window.half_y,
-            window.x + window.half_x, window.y + window.half_y,
-        )  # fmt: skip
+            window.x - window.half_x,
+            window.y - window.half_y,
+            window.x + window.half_x,
+            window.y + window.half_y,
+        )
     x, y = row.pose if row.pose is not None else (window.x, window.y) if window is not None else (0.0, 0.0)
     name = row.client or row.command or str(row.pid)
     return Follower(x, y, row.heading, name, box, window is not None and window.shape == "circle")

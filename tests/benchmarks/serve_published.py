@@ -98,7 +98,7 @@ def loader(url: str, jobs: list[CellJob]) -> None:
         reader.fetcher.begin(number, spec, job)
     while waiting:
         select.select([reader.fetcher.fd], [], [])
-        done = reader.fetcher.done()
+        done = reader.fetcher.take_done()
         if done is not None:
             job, fd = waiting.pop(done), segment_file()
             made = make_layer(spec, CellJob(job.cell_id, job.source, job.box, reader=reader, ready=1), fd)

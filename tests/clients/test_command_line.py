@@ -267,7 +267,7 @@ def test_a_missing_package_is_one_clear_line(package: str, tmp_path: Path) -> No
         "rolling_map": ["run", "--live", "lidar", "--scans", str(tmp_path)],
     }[package]
     code = (
-        "import sys\nfor name in ('numba', 'xxhash', 'lzf', 'yaml', 'open3d', 'rich'):\n"
+        "import sys\nfor name in ('numba', 'xxhash', 'lzf', 'yaml', 'open3d'):\n"
         "    sys.modules[name] = None\n"
         f"from shmmap_clients.{package}.cli import main\nsys.exit(main(sys.argv[1:]))"
     )

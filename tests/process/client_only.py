@@ -36,7 +36,7 @@ with shmmap.MapWindow(sys.argv[1], radius=25) as window:
 json.dump({"digests": digests, "packages": packages, "where": shmmap.__file__}, sys.stdout)
 """
 
-DAEMON_ONLY = {"open3d", "open3d_cpu", "xxhash", "python_neo_lzf", "pyyaml", "rich"}
+DAEMON_ONLY = {"open3d", "open3d_cpu", "xxhash", "python_neo_lzf", "pyyaml"}
 
 
 def check(python: str, *, separate_install: bool = True) -> None:

@@ -349,10 +349,10 @@ def test_exit_codes_without_a_daemon(words: list[str], code: int, tmp_path: Path
 
 
 def test_help_status_and_errors_need_only_the_standard_library(reading: Shmmap) -> None:
-    """A client-only install has no rich, yaml or Open3D, and a broken one perhaps not even numpy."""
+    """A client-only install has no yaml or Open3D, and a broken one perhaps not even numpy."""
     program = (
         "import sys\n"
-        "names = ['numpy', 'zmq', 'posix_ipc', 'rich', 'yaml', 'xxhash', 'lzf', 'open3d']\n"
+        "names = ['numpy', 'zmq', 'posix_ipc', 'yaml', 'xxhash', 'lzf', 'open3d']\n"
         "for name in [*names, 'msgspec']:\n"
         "    sys.modules[name] = None\n"
         "from shmmap.cli import main\n"

@@ -8,7 +8,6 @@ import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from types import TracebackType
 from typing import Any, Final, NoReturn
 
 import numpy as np
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 
 from shmmap import BadRequest, Client, MapWindow, NoAnswer, ShmmapError
 from shmmap.layers import canonical_layer, ground_height
+from shmmap_clients.closed_at_end import ClosedAtEnd
 from shmmap_clients.map_extent import NoMapHere, map_extent
 from shmmap_clients.ndt_scan_matcher import (
     DeviceError,
@@ -167,7 +167,7 @@ class InitializerRules:
         return [half * effort, *_split(self.candidates - half, 4)]
 
 
-class PoseInitializer:
+class PoseInitializer(ClosedAtEnd):
     """Searcher of initial poses, which keeps its map for the next search.
 
     Parameters
@@ -228,14 +228,6 @@ class PoseInitializer:
         )
         self._map = VoxelMap({})
         self._versions: dict[tuple[str, str], int] = {}
-
-    def __enter__(self) -> PoseInitializer:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Release the map, and end the initializer's own session, if any."""

@@ -15,7 +15,6 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from queue import SimpleQueue
-from types import TracebackType
 from typing import Final
 
 import msgspec
@@ -24,6 +23,7 @@ from cyclonedds.topic import Topic
 
 from shmmap import Client
 from shmmap.live import LiveMap
+from shmmap_clients.closed_at_end import ClosedAtEnd
 from shmmap_clients.ros_bridge.live_worker import LIVE_SERVICES, LiveWorker
 from shmmap_clients.ros_bridge.map_worker import MapWorker
 from shmmap_clients.ros_bridge.messages import (
@@ -100,7 +100,7 @@ class BridgeSettings(msgspec.Struct, frozen=True):
         return resolved(self.names.get(what, NAMES[what]), self.namespace)
 
 
-class RosBridge:
+class RosBridge(ClosedAtEnd):
     """Serves the daemon's map to ROS nodes.
 
     Parameters
@@ -183,14 +183,6 @@ class RosBridge:
                 self._add(f"{own}/{name}", kind, self._listening)
             self._write_status()
             self._undo = undo.pop_all()
-
-    def __enter__(self) -> RosBridge:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def stop(self) -> None:
         """End `run`; may be called from a signal handler."""

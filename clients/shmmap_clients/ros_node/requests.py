@@ -23,6 +23,7 @@ from shmmap_clients.ros_cells import LATER, StillLoading
 MAX_WAITING: Final = 1024
 """Requests that may wait; above it the oldest, whose client has given up, is answered with nothing."""
 _AWAY: Final = (DaemonUnreachable, ProtocolMismatch)
+_THREADS: Final = 4
 
 
 @dataclass(slots=True, eq=False)
@@ -35,7 +36,7 @@ class _Request:
 
 
 class Requests:
-    """Threads with a client each, and the table of requests that wait.
+    """Threads with a client each, and the table of requests that wait; they end with the process.
 
     Parameters
     ----------
@@ -45,8 +46,6 @@ class Requests:
         Time for the cells of a request to load, seconds, while the daemon is there.
     warn, inform
         Called with a line when the daemon no longer answers, and when it does again.
-    threads
-        Number of threads; they end with the process.
 
     Attributes
     ----------
@@ -62,7 +61,6 @@ class Requests:
         wait_s: float,
         warn: Callable[[str], None],
         inform: Callable[[str], None],
-        threads: int = 4,
     ) -> None:
         self.reachable: bool | None = None
         self.waiting: dict[int, _Request] = {}
@@ -71,7 +69,7 @@ class Requests:
         self._ready: PriorityQueue[tuple[int, int]] = PriorityQueue()  # numbers of requests, new ones first
         self._loading: deque[int] = deque()
         self._count = 0
-        for _ in range(threads):
+        for _ in range(_THREADS):
             threading.Thread(target=self._run, daemon=True).start()
 
     def ask(self, work: Callable[[Client, bool], Any], done: Callable[[Any], None]) -> None:

@@ -8,12 +8,12 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Final
 
 from shmmap import BadRequest, MapDataError
 from shmmap.errors import MapMissing, ShmmapError
 from shmmap.layers import needed_packages
+from shmmap_clients.closed_at_end import ClosedAtEnd
 from shmmap_clients.scans.scan_file import SCAN_SUFFIXES
 
 _FILES: Final = (".db3", ".mcap")
@@ -80,7 +80,7 @@ class Topic:
     messages: int
 
 
-class Bag:
+class Bag(ClosedAtEnd):
     """A bag that is open for reading.
 
     Parameters
@@ -129,14 +129,6 @@ class Bag:
         except BaseException:
             self.close()
             raise
-
-    def __enter__(self) -> Bag:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Close the files."""

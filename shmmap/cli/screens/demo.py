@@ -14,110 +14,75 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from shmmap.cli.screens.output import Column, format_bytes, format_duration, print_line, print_table
+from shmmap.cli.screens.output import (
+    Column,
+    format_bytes,
+    format_duration,
+    print_line,
+    print_table,
+    printable,
+)
 from shmmap.demo.program import Progress
 
 if TYPE_CHECKING:
-    from rich.live import Live
-    from rich.progress import TaskID
-
     from shmmap.demo.demo import DemoResult
 
-_PLAIN_EVERY_S: Final = 10.0
-
-_BAR: Final = 12  # columns: leave room for the stage's text, numbers and time beside the bar
+_EVERY_S: Final = 10.0
 
 
-class PlainProgress(Progress):
-    """Prints a line when a stage begins, one per event, and one every ten seconds of a long stage."""
+class DemoProgress(Progress):
+    """Prints stages and events, and how far a long stage is.
+
+    That is a line every ten seconds; on a terminal it is drawn again at each step, with the step's lines.
+    """
 
     def __init__(self) -> None:
-        self._total = self._done = 0
+        self._is_live = sys.stdout.isatty() and os.environ.get("TERM", "dumb") != "dumb"
+        self._total = self._done = self._drawn = 0
         self._printed_s = 0.0
 
     def stage(self, text: str, total: int) -> None:
         """Print that a stage begins."""
         self._total, self._done, self._printed_s = total, 0, time.monotonic()
-        print_line(f"{text} ...", flush=True)
+        self._print(f"{text} ...")
 
     def step(self, *lines: str) -> None:
-        """Print the progress of a long stage."""
-        del lines
+        """Show the progress of the stage."""
         self._done += 1
-        now_s = time.monotonic()
-        if now_s - self._printed_s >= _PLAIN_EVERY_S and self._done < self._total:
+        text = f"  step {self._done} of {self._total}"
+        if self._is_live:
+            width = shutil.get_terminal_size().columns - 1
+            shown = [text, *(f"    {line}" for line in lines)]
+            self._print(*(printable(line)[:width] for line in shown))
+            self._drawn = len(shown)
+        elif (now_s := time.monotonic()) - self._printed_s >= _EVERY_S and self._done < self._total:
             self._printed_s = now_s
-            print_line(f"  step {self._done} of {self._total}", flush=True)
+            self._print(text)
 
     def event(self, text: str) -> None:
         """Print an event."""
-        print_line(f"  {text}", flush=True)
+        self._print(f"  {text}")
 
+    def clear(self) -> None:
+        """Remove what was drawn of the last step."""
+        sys.stdout.write(f"\x1b[{self._drawn}A\x1b[J" if self._drawn else "")
+        self._drawn = 0
 
-class LiveProgress(Progress):
-    """Shows a bar per stage; below the bars the last event, and the lines of the last step."""
-
-    def __init__(self, live: Live) -> None:
-        from rich.progress import BarColumn, MofNCompleteColumn, TimeElapsedColumn
-        from rich.progress import Progress as Bars
-
-        self._live = live
-        self._bars = Bars(
-            "  {task.description}",
-            BarColumn(_BAR),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            auto_refresh=False,
-        )
-        self._stage: TaskID | None = None
-        self._event = ""
-
-    def stage(self, text: str, total: int) -> None:
-        """Draw a new bar."""
-        self._stage, self._event = self._bars.add_task(text, total=total), ""
-        self._draw()
-
-    def step(self, *lines: str) -> None:
-        """Draw the current step and its lines."""
-        if self._stage is not None:
-            self._bars.advance(self._stage)
-        self._draw(*lines)
-
-    def event(self, text: str) -> None:
-        """Show an event until the stage ends or the next event."""
-        self._event = text
-        self._draw()
-
-    def close(self) -> None:
-        """Stop the display; only the bars stay on the screen."""
-        self._event = ""
-        self._draw()
-
-    def _draw(self, *lines: str) -> None:
-        from rich.console import Group
-        from rich.text import Text
-
-        below = [Text(f"  {self._event}", style="yellow")] if self._event else []
-        below += [Text(f"    {line}", style="cyan", overflow="ellipsis", no_wrap=True) for line in lines]
-        self._live.update(Group(self._bars, *below), refresh=True)
+    def _print(self, *lines: str) -> None:
+        self.clear()
+        for line in lines:
+            print_line(line, flush=True)
 
 
 @contextlib.contextmanager
 def progress_for(*, quiet: bool) -> Iterator[Progress]:
-    """Return the progress display: none, lines, or a live view if the terminal supports it."""
+    """Return the progress display."""
     if quiet:
         yield Progress()
         return
-    if not sys.stdout.isatty() or os.environ.get("TERM", "dumb") == "dumb":
-        yield PlainProgress()
-        return
-    from rich.console import Console
-    from rich.live import Live
-
-    with Live(console=Console(highlight=False), auto_refresh=False, transient=False) as live:
-        progress = LiveProgress(live)
-        yield progress
-        progress.close()
+    progress = DemoProgress()
+    yield progress
+    progress.clear()
 
 
 _WIDTH: Final = 79  # columns of the longest line

@@ -183,9 +183,20 @@ _TICK_COLUMNS: Final = 12
 _TICK_LINES: Final = 4
 _AXIS: Final = "bright_black"
 _SOLID: Final = {
-    "resident": "█", "ahead": "▓", "stale": "▓", "retired": "▒", "disk": "·", "window": "○", "client": "●",
-    "saved": "·", "clean": "█", "loading": "█", "saving": "█", "dirty": "█", "none": " ",
-}  # fmt: skip
+    "resident": "█",
+    "ahead": "▓",
+    "stale": "▓",
+    "retired": "▒",
+    "disk": "·",
+    "window": "○",
+    "client": "●",
+    "saved": "·",
+    "clean": "█",
+    "loading": "█",
+    "saving": "█",
+    "dirty": "█",
+    "none": " ",
+}
 
 
 def glyph(state: str, *, solid: bool) -> str:

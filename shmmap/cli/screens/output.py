@@ -54,9 +54,15 @@ Line: TypeAlias = list[tuple[str, str]]
 """A line of text in pieces, each with its style: words of `_CODES`, or empty."""
 
 _CODES: Final = {
-    "bold": 1, "red": 31, "green": 32, "yellow": 33, "blue": 34, "magenta": 35, "cyan": 36,
+    "bold": 1,
+    "red": 31,
+    "green": 32,
+    "yellow": 33,
+    "blue": 34,
+    "magenta": 35,
+    "cyan": 36,
     "bright_black": 90,
-}  # fmt: skip
+}
 """Numbers of ECMA-48's SGR by word of a style."""
 
 

@@ -151,8 +151,9 @@ STATE_STYLES: Final = {
     "clean": "green",
     "dirty": "blue",
     "saving": "cyan",
+    "saved": "bright_black",
 }
-"""Colours of chunks by state, the same as in Rolling-Bonxai."""
+"""Colours of chunks by state, the same as in Rolling-Bonxai: clean green, dirty blue, not in memory dark."""
 
 
 def live_problems(row: LiveMapRow) -> list[str]:

@@ -128,8 +128,17 @@ class View:
             names = list(ORDERS)
             self.order = names[(names.index(self.order) + 1) % len(names)]
             self.scroll = 0
-        steps = {"j": 1, "down": 1, "k": -1, "up": -1, "page down": self._page, " ": self._page,
-                 "page up": -self._page, "g": -self.scroll, "home": -self.scroll}  # fmt: skip
+        steps = {
+            "j": 1,
+            "down": 1,
+            "k": -1,
+            "up": -1,
+            "page down": self._page,
+            " ": self._page,
+            "page up": -self._page,
+            "g": -self.scroll,
+            "home": -self.scroll,
+        }
         self.scroll = max(self.scroll + steps.get(key, 0), 0)
         if key in ("G", "end"):
             self.scroll = _FAR

@@ -59,7 +59,7 @@ class PressureEvents:
         self._last: tuple[str, str, str] = ("", "", "")
         self._published_s = self._logged_s = float("-inf")
 
-    def refused(self, cell_id: str, layer: str, code: str, now_s: float) -> None:
+    def note_refusal(self, cell_id: str, layer: str, code: str, now_s: float) -> None:
         """Note that a cell was refused."""
         self._refused += 1
         self._unlogged += 1
@@ -109,15 +109,15 @@ class EvictionHistory:
     def __len__(self) -> int:
         return len(self._versions)
 
-    def evicted(self, key: Key, version: int) -> None:
+    def note_eviction(self, key: Key, version: int) -> None:
         """Note that this version was evicted for lack of memory."""
         self._versions.pop(key, None)
         self._versions[key] = version
         if len(self._versions) > MAX_EVICTED:
             self._versions.popitem(last=False)
 
-    def loaded(self, key: Key, version: int) -> bool:
-        """Whether a load brought back a version that had been evicted for lack of memory."""
+    def take_eviction(self, key: Key, version: int) -> bool:
+        """Forget the eviction of a key that is loaded again; return whether it was of this version."""
         return self._versions.pop(key, None) == version
 
 
@@ -158,11 +158,11 @@ class PrefetchMisses:
         """Return the number of clients remembered."""
         return len(self._waited)
 
-    def arrived(self, cell_id: str, layer: str) -> None:
+    def note_arrival(self, cell_id: str, layer: str) -> None:
         """Note that a cell has arrived, so that no client waits for it any more."""
         self._absent.pop((cell_id, layer), None)
 
-    def note(self, session: Session, cell_id: str, layer: str) -> bool:
+    def note_wait(self, session: Session, cell_id: str, layer: str) -> bool:
         """Note that a client has to wait for a cell; return False if it already waits for it.
 
         Parameters
@@ -186,7 +186,7 @@ class PrefetchMisses:
         one.cell_id, one.layer = cell_id, layer
         return True
 
-    def turn(self, now_s: float) -> None:
+    def publish_due(self, now_s: float) -> None:
         """Publish the events of some clients, the longest pending first."""
         for slot, one in list(islice(self._waited.items(), MAX_EVENTS_PER_TURN)):
             if now_s < one.quiet_until_s:
@@ -260,7 +260,7 @@ class CellEvents:
         """Publish and log periodic reports, a few times a second."""
         self._pressure.step(now_s)
         self.minutes.step(now_s)
-        self._misses.turn(now_s)
+        self._misses.publish_due(now_s)
 
     def close(self) -> None:
         """Log what the lines of this minute would have counted."""
@@ -280,7 +280,7 @@ class CellEvents:
         ``cached``: the layer came from the disk cache; ``ahead``: no client had asked for it yet.
         """
         again = self._publish_loaded(resident, resident.load_ns, replaces, ahead)
-        self._misses.arrived(self._id(resident.key.cell_id), resident.key.layer)
+        self._misses.note_arrival(self._id(resident.key.cell_id), resident.key.layer)
         points = resident.key.layer == LAYER
         source = "load_cached" if cached else "load_points" if points else "load_computed"
         statistics = self._statistics
@@ -298,7 +298,7 @@ class CellEvents:
 
     def _publish_loaded(self, resident: Resident, load_ns: int, replaces: int, ahead: bool) -> bool:
         """Publish that a segment is in service; return whether it had been evicted for lack of memory."""
-        again = self._history.loaded(resident.key, resident.version)
+        again = self._history.take_eviction(resident.key, resident.version)
         self._log.publish(
             events.Loaded,
             self._id(resident.key.cell_id),
@@ -320,7 +320,7 @@ class CellEvents:
     def retired(self, resident: Resident, why: str) -> None:
         """Report that a segment left service, unless it was superseded: its successor's event is enough."""
         if why == "room":
-            self._history.evicted(resident.key, resident.version)
+            self._history.note_eviction(resident.key, resident.version)
         if why != "superseded":
             cell, layer = resident.key
             reason = "budget" if why == "room" else why
@@ -331,7 +331,7 @@ class CellEvents:
     def failed(self, key: Key, failure: Failure, now_s: float) -> None:
         """Report that a load ended without a segment."""
         if failure.code in SPACE_CODES:
-            self._pressure.refused(self._id(key.cell_id), key.layer, failure.code, now_s)
+            self._pressure.note_refusal(self._id(key.cell_id), key.layer, failure.code, now_s)
         else:
             self._log.publish(
                 events.Failed,
@@ -350,8 +350,10 @@ class CellEvents:
     def refused_by_quota(self, key: Key, now_s: float) -> None:
         """Count and report a cell that would exceed its session's quota."""
         self._statistics.add("refused_quota")
-        self._pressure.refused(self._id(key.cell_id), key.layer, "quota", now_s)
+        self._pressure.note_refusal(self._id(key.cell_id), key.layer, "quota", now_s)
 
     def prefetch_missed(self, session: Session, key: Key) -> None:
         """Count and report that a moving client has to wait for a cell, unless it waits already."""
-        self._statistics.add("prefetch_misses", self._misses.note(session, self._id(key.cell_id), key.layer))
+        self._statistics.add(
+            "prefetch_misses", self._misses.note_wait(session, self._id(key.cell_id), key.layer)
+        )

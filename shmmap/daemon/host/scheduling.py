@@ -29,35 +29,23 @@ loads: at 0, 3, 5, 7 and 10 the p99 of warm requests is 3.6, 3.7, 3.1, 2.5 and 1
 nice values alone, p99 is 2.8 instead of 4.5 ms, and loads take 1.15 times as long.  Separate groups in it for
 daemon and loaders, with weights 100 and 11, give the same result."""
 
-_SYSCALLS: Final = {"x86_64": (314, 315), "aarch64": (274, 275)}  # sched_setattr, sched_getattr
-_ATTRIBUTES: Final = struct.Struct("=IIQiIQQQ")  # struct sched_attr, first version (linux/sched/types.h)
+SCHED_SETATTR: Final = {"x86_64": 314, "aarch64": 274}
+"""Number of the system call; that of sched_getattr is the next one."""
+ATTRIBUTES: Final = struct.Struct("=IIQiIQQQ")
+"""struct sched_attr, first version (linux/sched/types.h); the sixth field is the slice, nanoseconds."""
 
 
-def take_slices(nanoseconds: int) -> bool:
+def take_slices(nanoseconds: int) -> None:
     """Request time slices of this length for the calling thread and its children; 0 restores the default.
 
-    Policy and nice value stay unchanged; threads of other policies than the ordinary one are left alone.
-    Returns whether the kernel agreed.
+    Policy and nice value stay unchanged; threads of other policies than the ordinary one are left alone.  A
+    kernel that refuses is no error.
     """
-    numbers = _SYSCALLS.get(platform.machine())
-    if numbers is None or os.sched_getscheduler(0) != os.SCHED_OTHER:
-        return False
-    niceness = os.getpriority(os.PRIO_PROCESS, 0)
-    wanted = _ATTRIBUTES.pack(_ATTRIBUTES.size, os.SCHED_OTHER, 0, niceness, 0, nanoseconds, 0, 0)
-    if ctypes.CDLL(None, use_errno=True).syscall(numbers[0], 0, wanted, 0) != 0:
-        return False
-    return nanoseconds == 0 or slice_ns() == nanoseconds
-
-
-def slice_ns() -> int:
-    """Return the calling thread's time slice as the kernel reports it; 0 if it reports none."""
-    numbers = _SYSCALLS.get(platform.machine())
-    if numbers is None:
-        return 0
-    found = ctypes.create_string_buffer(_ATTRIBUTES.size)
-    if ctypes.CDLL(None, use_errno=True).syscall(numbers[1], 0, found, _ATTRIBUTES.size, 0) != 0:
-        return 0
-    return int(_ATTRIBUTES.unpack(found.raw)[5])
+    number = SCHED_SETATTR.get(platform.machine())
+    if number is not None and os.sched_getscheduler(0) == os.SCHED_OTHER:
+        niceness = os.getpriority(os.PRIO_PROCESS, 0)
+        wanted = ATTRIBUTES.pack(ATTRIBUTES.size, os.SCHED_OTHER, 0, niceness, 0, nanoseconds, 0, 0)
+        ctypes.CDLL(None).syscall(number, 0, wanted, 0)
 
 
 def weigh_less(niceness: int = LOADER_GROUP_NICENESS, proc: str = "/proc/self") -> bool:

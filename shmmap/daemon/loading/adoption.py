@@ -161,9 +161,17 @@ class Adoption:
         except (SegmentCorrupt, OSError, UnicodeDecodeError) as error:
             return unknown, 0, str(error)
         resident = Resident(
-            live_name, Key(header.cell_id, header.layer), block.version, nbytes, header.rows, header.box,
-            header.z_min, header.z_max, last_use_s=now_s - HAND_OUT_GRACE_S, checked=False,
-        )  # fmt: skip
+            live_name,
+            Key(header.cell_id, header.layer),
+            block.version,
+            nbytes,
+            header.rows,
+            header.box,
+            header.z_min,
+            header.z_max,
+            last_use_s=now_s - HAND_OUT_GRACE_S,
+            checked=False,
+        )
         return resident, header.outside_points, self._why_not(name, status, header, resident)
 
     def _why_not(self, name: str, status: os.stat_result, header: SegmentHeader, resident: Resident) -> str:

@@ -70,6 +70,21 @@ class _Current(NamedTuple):
     version: int
 
 
+class _LeftOut(NamedTuple):
+    """A layer of a cell that could not be made in a version, and how many loaders were killed at it.
+
+    Version 0: its source could not be read, so it is left out of this pass alone.
+    """
+
+    version: int
+    kills: int = 0
+
+    @property
+    def is_tried_again(self) -> bool:
+        """Whether it is tried again when all others are done: others' use of memory may be to blame."""
+        return 0 < self.kills < MAX_TRIES
+
+
 class Preparer:
     """Prepares layers, as a background task of the serving loop.
 
@@ -104,10 +119,7 @@ class Preparer:
         self._current: _Current | None = None
         self._number, self._next_s = 0, -math.inf
         self._done = self._failed = self._bytes = 0
-        self._left_out: dict[Key, int] = {}  # versions of the layers that could not be made
-        self._kills: dict[
-            Key, tuple[int, int]
-        ] = {}  # of these, versions that loaders were killed at; how often
+        self._left_out: dict[Key, _LeftOut] = {}
         self._retries: dict[Key, tuple[str, int]] = {}
         self._is_retry = False
         self._begin()
@@ -147,12 +159,14 @@ class Preparer:
             layer, index = one
             version = self._cache.layers.version(index, layer)
             key = self._cache.key(index, layer)
-            if self._is_retry or self._left_out.get(key) != version:
+            left_out = self._left_out.get(key)
+            if self._is_retry or left_out is None or left_out.version != version:
                 self._again = one
                 self._hand_out(_Current(index, layer, version), now_s)
                 return
             self._failed += 1
-            self._note_retry(key, layer, index)
+            if left_out.is_tried_again:
+                self._retries[key] = one
         self._show()
 
     def _begin(self) -> None:
@@ -213,19 +227,22 @@ class Preparer:
         current, self._current = self._current, None
         if current is None or message.number != self._number:
             return
+        is_of_this_map = self._catalogue is self._cache.catalogue
         if isinstance(message, Failed):
             if message.code == CannotWrite.code or message.code in SPACE_CODES:
                 self._cannot_write(message.message, now_s)
                 return
-            self._leave_out(current, message.message, until_changed=not message.unread)
+            if is_of_this_map:
+                left_out = _LeftOut(0 if message.unread else current.version)
+                self._leave_out(current, message.message, left_out)
         else:
             self._statistics.add("layers_prepared", message.computed)
-            if self._catalogue is self._cache.catalogue:
+            if is_of_this_map:
                 self._again = None
                 if self._is_retry:
                     key = self._cache.key(current.cell, current.layer)
                     self._failed -= 1
-                    del self._left_out[key], self._kills[key], self._retries[key]
+                    del self._left_out[key], self._retries[key]
                 self._done, self._bytes = self._done + 1, self._bytes + message.bytes
         self._show(short=0)
         if self._bytes > FULL_SHARE * self._cache_bytes:
@@ -245,10 +262,8 @@ class Preparer:
         self._show(short=2)
         self._next_s = now_s + RETRY_S
 
-    def _leave_out(self, current: _Current, why: str, *, until_changed: bool = True) -> None:
+    def _leave_out(self, current: _Current, why: str, left_out: _LeftOut) -> None:
         """Leave out a layer that could not be made, and log it once."""
-        if self._catalogue is not self._cache.catalogue:
-            return
         self._again = None
         self._failed += not self._is_retry
         key = self._cache.key(current.cell, current.layer)
@@ -258,7 +273,9 @@ class Preparer:
             log.warning("layer not prepared", cell=key.cell_id, layer=key.layer, message=why)
             if more:
                 log.warning("more layers cannot be prepared: they are not named")
-        self._left_out[key] = current.version if until_changed else 0
+        self._left_out[key] = left_out
+        if left_out.is_tried_again:
+            self._retries[key] = current.layer, current.cell
 
     def _lost(self, worker: Worker, how: str, now_s: float) -> None:
         """Replace a loader that died or took too long: what it worked on is left out."""
@@ -268,23 +285,12 @@ class Preparer:
         current, self._current = self._current, None
         if current is None:
             return
-        if ready and how:
-            self._leave_out(current, f"{self._source(current)}: the loader died of it ({how})")
-            if self._catalogue is self._cache.catalogue:
-                key = self._cache.key(current.cell, current.layer)
-                version, times = self._kills.get(key, (current.version, 0))
-                self._kills[key] = current.version, times + 1 if version == current.version else 1
-                self._note_retry(key, current.layer, current.cell)
-            self._show()
-        else:  # its parent ended, or it could not start
+        if not ready or not how:  # its parent ended, or it could not start
             self._next_s = now_s + RETRY_S
-
-    def _note_retry(self, key: Key, layer: str, cell: int) -> None:
-        """Have a layer tried again that is left out since loaders were killed at it, unless too many were."""
-        version, times = self._kills.get(key, (0, MAX_TRIES))
-        if times < MAX_TRIES and version == self._left_out.get(key):
-            self._retries[key] = layer, cell
-
-    def _source(self, current: _Current) -> str:
-        same = self._catalogue is self._cache.catalogue
-        return self._cache.catalogue.source(current.cell).name if same else "a cell of the former map"
+        elif self._catalogue is self._cache.catalogue:
+            before = self._left_out.get(self._cache.key(current.cell, current.layer))
+            kills = before.kills + 1 if before is not None and before.version == current.version else 1
+            source = self._cache.catalogue.source(current.cell).name
+            why = f"{source}: the loader died of it ({how})"
+            self._leave_out(current, why, _LeftOut(current.version, kills))
+            self._show()

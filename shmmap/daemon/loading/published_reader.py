@@ -17,7 +17,7 @@ from shmmap.daemon.loading import worker_messages
 from shmmap.errors import LoadFailed, MapDataError, Offline, ShmmapError
 from shmmap.layers.contract import Box
 from shmmap.layers.points import LAYER
-from shmmap.layers.sources import CellJob, CellSource
+from shmmap.layers.sources import CellJob, CellSource, SourceReader
 from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.origin.remote.object_tier import KeptObjects, ObjectCounts, kept_objects
 from shmmap.origin.remote.opened_store import ServedFrom, open_for_serving
@@ -167,7 +167,7 @@ class ObjectFetcher:
             self._finish_if_complete(number)
             self._begin_some()
 
-    def done(self) -> int | None:
+    def take_done(self) -> int | None:
         """Return the number of a job whose objects have all been fetched, or have failed."""
         with self._lock:
             self._forget_last()
@@ -299,8 +299,10 @@ def _needed(spec: LayerSpec, job: CellJob | worker_messages.Job) -> Iterator[Obj
         yield unpack_source(near.source)[LAYER].name
 
 
-class PublishedReader:
-    """Reads sources stored as objects of a published map; see `shmmap.layers.sources.SourceReader`."""
+class PublishedReader(SourceReader):
+    """Reads sources stored as objects of a published map."""
+
+    fetcher: ObjectFetcher
 
     def __init__(
         self,
@@ -360,15 +362,6 @@ class PublishedReader:
                 cause=DAMAGED,
             )
         return header
-
-    def named(self, message: str) -> str:
-        """Return the message unchanged: it names cells by their ids."""
-        return message
-
-    def explain(self, source: Source, message: str) -> str:
-        """Return the message unchanged."""
-        del source
-        return message
 
     def take_counts(self) -> tuple[int, ...]:
         """Return the counts of reads since the last call; empty if there were none."""

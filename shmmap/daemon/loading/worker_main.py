@@ -113,7 +113,7 @@ class _Worker:
                 both.register(self.channel, select.POLLIN)
                 both.register(fetcher.fd, select.POLLIN)
                 ready = {fd for fd, _ in both.poll()}
-                if fetcher.fd in ready and (number := fetcher.done()) is not None:
+                if fetcher.fd in ready and (number := fetcher.take_done()) is not None:
                     self._send(worker_messages.Begun(number))
                     return self._fetching.pop(number)
                 if self.channel.fileno() not in ready:

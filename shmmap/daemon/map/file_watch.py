@@ -174,8 +174,8 @@ class FileWatch:
             self._since_s = now_s
         self._last_s = now_s
 
-    def due(self, now_s: float) -> bool:
-        """Return whether to read the map again now; True once per change."""
+    def take_change(self, now_s: float) -> bool:
+        """Return whether to read the map again now, and forget the changes if so."""
         if self._missing and now_s >= self._look_s:
             self._look_s = now_s + LOOK_S
             before = len(self._missing)

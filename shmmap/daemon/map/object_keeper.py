@@ -10,7 +10,6 @@ import contextlib
 import os
 import queue
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
@@ -22,8 +21,6 @@ from shmmap.origin.remote.published_object import ObjectName
 from shmmap.origin.remote.transport import reporting_bytes
 
 THREADS: Final = 8
-END_S: Final = 0.2
-"""How long a daemon that stops waits for a thread that waits for the store, seconds."""
 
 
 class KeptCell(NamedTuple):
@@ -149,14 +146,11 @@ class ObjectKeeper:
             return Kept(key, False)
         return Kept(key, True)
 
-    def close(self) -> bool:
-        """End the threads; return False if one still waits for the store."""
+    def close(self) -> list[threading.Thread]:
+        """Have the threads end, and return them; some may still wait for the store."""
         with contextlib.suppress(queue.Empty):
             while True:
                 self._wanted.get_nowait()
         for _ in self._threads:
             self._wanted.put(None)
-        until_s = time.monotonic() + END_S
-        for thread in self._threads:
-            thread.join(max(0.0, until_s - time.monotonic()))
-        return not any(thread.is_alive() for thread in self._threads)
+        return self._threads

@@ -21,7 +21,6 @@ JITTER: Final = 0.2
 """Random part of the polling interval: the vehicles of a fleet must not poll simultaneously."""
 LONG_TRUST_S: Final = 32.0
 """Longest delay of a poll after a failed fetch, for an origin that keeps answering."""
-END_S: Final = 0.2
 
 
 class LinkNews(NamedTuple):
@@ -45,6 +44,8 @@ class OriginLink:
     ----------
     fd
         Readable when there are results: call `take` then.
+    is_out : bool
+        Whether the origin failed to answer the last poll or fetch.
     """
 
     def __init__(self, ask: Callable[[], bool], poll_s: float) -> None:
@@ -52,7 +53,7 @@ class OriginLink:
         self._ask = ask
         self._poll_s = poll_s
         self._condition = threading.Condition()
-        self._is_out = self._is_doubted = self._has_failed = False
+        self.is_out = self._is_doubted = self._has_failed = False
         self._answered_s = -math.inf
         self._trust_s = PROBE_S
         self._changed = self._back = False
@@ -62,14 +63,9 @@ class OriginLink:
             self._start()
 
     @property
-    def is_out(self) -> bool:
-        """Whether the origin failed to answer the last poll or fetch."""
-        return self._is_out
-
-    @property
     def is_doubted(self) -> bool:
         """Whether the origin is or may be unreachable, so that it is being polled."""
-        return self._is_out or self._is_doubted
+        return self.is_out or self._is_doubted
 
     @property
     def is_lost(self) -> bool:
@@ -81,7 +77,7 @@ class OriginLink:
         """Start the thread again; until it has polled, the origin counts as unreachable."""
         with self._condition:
             self._thread = None
-            self._is_out = True
+            self.is_out = True
             os.eventfd_write(self.fd, 1)
             self._start()
 
@@ -95,7 +91,7 @@ class OriginLink:
                 return
             self._is_doubted = True
             if time.monotonic() >= self._answered_s + self._trust_s:
-                self._is_out = True
+                self.is_out = True
                 os.eventfd_write(self.fd, 1)
             self._start()
             self._condition.notify()
@@ -124,7 +120,7 @@ class OriginLink:
                 self._thread = thread
 
     def _run(self) -> None:
-        asked_s = -math.inf if self._is_out else time.monotonic()
+        asked_s = -math.inf if self.is_out else time.monotonic()
         while True:
             wait_s = self._poll_s * random.uniform(1 - JITTER, 1 + JITTER)  # noqa: S311  no secret
             with self._condition:
@@ -140,7 +136,7 @@ class OriginLink:
             self._look()
 
     def _due_s(self, asked_s: float, wait_s: float) -> float:
-        if self._is_out:
+        if self.is_out:
             return asked_s + PROBE_S
         if self._is_doubted:
             return self._answered_s + self._trust_s
@@ -163,7 +159,7 @@ class OriginLink:
                 self._note_answer(time.monotonic())
             elif not self._has_failed:
                 log.warning("the map's origin is out of reach", reason=reason)
-            self._has_failed = self._is_out = not answers
+            self._has_failed = self.is_out = not answers
             self._is_doubted = False
             self._changed = self._changed or changed
             os.eventfd_write(self.fd, 1)
@@ -178,11 +174,9 @@ class OriginLink:
             self._trust_s = min(2 * self._trust_s, LONG_TRUST_S)
         self._answered_s = now_s
 
-    def close(self) -> bool:
-        """End the thread; return False if it still waits for the origin."""
+    def close(self) -> list[threading.Thread]:
+        """Have the thread end, and return it, if there is one; it may still wait for the origin."""
         with self._condition:
             self._closed = True
             self._condition.notify()
-        if self._thread is not None:
-            self._thread.join(END_S)
-        return self._thread is None or not self._thread.is_alive()
+        return [] if self._thread is None else [self._thread]

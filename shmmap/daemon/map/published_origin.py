@@ -42,9 +42,9 @@ from shmmap.origin.remote.object_tier import KeptObjects, ObjectCounts, ObjectTi
 from shmmap.origin.remote.opened_store import ServedFrom, open_for_serving
 from shmmap.origin.remote.published_index import Root, Shard, unpack_root, unpack_shard
 from shmmap.origin.remote.store import PROBE, NoBucket, ObjectReader, Store
-from shmmap.origin.remote.taken_version import TakenVersion, TakenVersionFile, judge_offer
+from shmmap.origin.remote.taken_version import TakenVersion, TakenVersionFile, refusal_of
 from shmmap.origin.remote.verify_apart import Verified, VerifySettings, read_trusted_root, verify_apart
-from shmmap.processes.request_threads import RequestThreads
+from shmmap.processes.request_threads import RequestThreads, have_ended
 from shmmap.statistics.counters import REFUSALS
 
 NOTHING: Final = CurrentState(None, None)
@@ -101,6 +101,10 @@ class PublishedOrigin:
         Bytes of pages, and of objects kept on the disk, that have come from the origin.
     keeper
         Keeps objects of cells on the disk ahead of use; None without a disk cache.
+    taken
+        The version taken last, with the times of its signature; it may still wait for its pages.
+    in_service
+        The version that is served, as of the last `note_served`.
     """
 
     def __init__(
@@ -134,15 +138,15 @@ class PublishedOrigin:
         self._catalogue_bytes = catalogue_bytes
         self._poll_s = poll_s
         self._accept_version = accept_version
-        self._taken: TakenVersion | None = None
-        self._lock = threading.Lock()  # of `_taken`: reloads change it, and the polling thread reads it
+        self.taken: TakenVersion | None = None
+        self._lock = threading.Lock()  # of `taken`: reloads change it, and the polling thread reads it
         self._saving = threading.Lock()
         self._problem: _Problem | None = None
         self._refused = 0
         self._seen = NOTHING
         self._is_loading = False
         self._saved: TakenVersion | None = None
-        self._in_service: TakenVersion | None = None
+        self.in_service: TakenVersion | None = None
         self.link = OriginLink(self._has_another, poll_s)
         self.arrivals = Arrivals()
         self._fetcher = ShardFetcher(self._index, self.link.doubt, self.arrivals)
@@ -260,14 +264,14 @@ class PublishedOrigin:
     def _judge(self, offer: Verified) -> None:
         """Refuse an unacceptable version; the version taken may have been signed again."""
         with self._lock:
-            taken = self._taken
-            judged = judge_offer(taken, offer.current, accept=self._accept_version)
-            if judged.problem:
+            taken = self.taken
+            refused = refusal_of(taken, offer.current, accept=self._accept_version)
+            if refused is not None:
                 self._refused = offer.current.version
-                raise MapDataError(judged.problem, cause=judged.cause, hint=judged.hint)
+                raise refused
             if taken is not None and taken.current == offer.current:
                 again = msgspec.structs.replace(taken, signed_s=offer.signed_s, expires_s=offer.expires_s)
-                self._taken = taken if taken == again else again
+                self.taken = taken if taken == again else again
 
     def _read_root(self, current: Current) -> tuple[bytes, Root]:
         frame = read_root_object(self._index, current)
@@ -288,7 +292,7 @@ class PublishedOrigin:
             log.warning("the version taken last cannot be served", reason=error)
             return None
         with self._lock:
-            self._taken = self._saved = taken
+            self.taken = self._saved = taken
         return taken, root
 
     def _restored(self, taken: TakenVersion, root: Root) -> PublishedView:
@@ -303,7 +307,7 @@ class PublishedOrigin:
     def _take(self, taken: TakenVersion, root: Root, known: dict[int, Shard]) -> PublishedView:
         view = PublishedView(root, taken.version, self._fetcher, known, max_bytes=self._catalogue_bytes)
         with self._lock:
-            self._taken = taken
+            self.taken = taken
         if self._tier is not None:
             digests = [root.shard_sha256(number) for number in range(len(root.keys))]
             self._tier.mark_index_used([bytes.fromhex(taken.current.root), *digests])
@@ -330,7 +334,7 @@ class PublishedOrigin:
 
         That is another version than the one taken, a new problem with the offer, or the end of a problem.
         """
-        if self._taken is None:
+        if self.taken is None:
             return False
         is_same = self._is_same(self._probe if self.link.is_out else self._store)
         before = self._problem
@@ -339,7 +343,7 @@ class PublishedOrigin:
         try:
             offer = self._read_offer()
             self._judge(offer)
-            if offer.current != self._taken.current:
+            if offer.current != self.taken.current:
                 self._read_root(offer.current)
                 return True
         except ShmmapError as error:  # also if unreachable, although the origin has just answered
@@ -359,10 +363,10 @@ class PublishedOrigin:
 
     def note_served(self, view: object) -> None:
         """Record which version is served now."""
-        taken = self._taken
+        taken = self.taken
         if taken is None or not isinstance(view, PublishedView) or view.number != taken.version:
             return  # another version was taken, and waits for its pages
-        self._in_service = taken
+        self.in_service = taken
         if taken is self._saved or self._state is None:
             return
         self._saved = taken
@@ -379,22 +383,12 @@ class PublishedOrigin:
                 log.warning("the version taken cannot be remembered for the next start", reason=error)
 
     @property
-    def taken(self) -> TakenVersion | None:
-        """The version taken last, with the times of its signature; it may still wait for its pages."""
-        return self._taken
-
-    @property
     def refusal(self) -> str:
         """Why the offer is refused, one of `REFUSALS`; empty if it is accepted, or unreachable."""
         problem = self._problem
         if problem is None or problem.code == Offline.code:
             return ""
         return problem.cause if problem.cause in REFUSALS[1:] else REFUSALS[-1]
-
-    @property
-    def in_service(self) -> TakenVersion | None:
-        """The version that is served, as of the last `note_served`."""
-        return self._in_service
 
     @property
     def refused_version(self) -> int:
@@ -416,10 +410,10 @@ class PublishedOrigin:
 
     def close(self) -> bool:
         """End all threads; return False if one still waits for the origin."""
-        ended = [self.link.close(), self._fetcher.close()]
+        threads = self.link.close() + self._fetcher.close()
         if self.keeper is not None:
-            ended.append(self.keeper.close())
-        return all(ended) and not self._is_loading
+            threads += self.keeper.close()
+        return have_ended(threads) and not self._is_loading
 
 
 class _OnDisk:

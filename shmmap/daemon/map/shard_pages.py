@@ -8,7 +8,6 @@ import contextlib
 import heapq
 import os
 import threading
-import time
 import weakref
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -33,8 +32,6 @@ from shmmap.origin.remote.zstd_frame import DAMAGED
 THREADS: Final = 8
 BACKGROUND_FETCHES: Final = 2
 """Limit of concurrent fetches of pages that nothing needs yet."""
-END_S: Final = 0.2
-"""How long a daemon that stops waits for a thread that waits for the origin."""
 FEW_SHARDS: Final = 16
 """Up to this number of shards, all are fetched at the start, and kept."""
 NAME_BYTES: Final = 150
@@ -179,15 +176,12 @@ class ShardFetcher:
             self._arrivals.add_pages(-nbytes)
         return None
 
-    def close(self) -> bool:
-        """End the threads; return False if one still waits for the origin."""
+    def close(self) -> list[threading.Thread]:
+        """Have the threads end, and return them; some may still wait for the origin."""
         with self._condition:
             self._closed = True
             self._condition.notify_all()
-        until_s = time.monotonic() + END_S
-        for thread in self._threads:
-            thread.join(max(0.0, until_s - time.monotonic()))
-        return not any(thread.is_alive() for thread in self._threads)
+        return self._threads
 
 
 class ShardPages:

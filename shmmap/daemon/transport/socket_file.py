@@ -49,18 +49,13 @@ class SocketFile:
         self.path = path
         self._is_passed = passed is not None
         self.socket = passed if passed is not None else _listen(path, gid)
-        with contextlib.suppress(OSError):
-            self._status: os.stat_result | None = None
-            self._status = os.lstat(path)
+        self._status = _status(path)
 
     @property
     def is_there(self) -> bool:
         """Whether the path still leads clients to this socket."""
-        try:
-            found = os.lstat(self.path)
-        except OSError:
-            return False
-        return self._status is not None and os.path.samestat(found, self._status)
+        found = _status(self.path)
+        return found is not None and self._status is not None and os.path.samestat(found, self._status)
 
     def remove(self) -> None:
         """Remove the file, unless it is another program's."""
@@ -98,6 +93,14 @@ def refuse_taken(path: str) -> bool:
     if status.st_uid != os.geteuid():
         raise name_taken("the socket", path, None, otherwise=_OTHERWISE)
     return True
+
+
+def _status(path: str) -> os.stat_result | None:
+    """Return the status of a socket's file; None if there is none."""
+    try:
+        return os.lstat(path)
+    except OSError:
+        return None
 
 
 def _listen(path: str, gid: int) -> socket.socket:

@@ -20,10 +20,11 @@ import os
 import struct
 import time
 from hashlib import sha256
-from typing import Final, NamedTuple
+from typing import Final
 
 import msgspec
 
+from shmmap.errors import MapDataError
 from shmmap.failpoints import step
 from shmmap.formats.durable_file import appearing_file, flush_directory, writing_errors
 from shmmap.origin.remote.map_versions import Current
@@ -180,27 +181,8 @@ class TakenVersionFile:
         return f"it is kept as {aside}"
 
 
-class Judgement(NamedTuple):
-    """Decision whether an offered version is taken.
-
-    Attributes
-    ----------
-    is_taken
-        Whether the version is to be fetched, saved, and then served.
-    problem, hint
-        Problem with the offer, for ``health``, and its remedy; empty if there is no problem.
-    cause
-        Short name of the problem: ``older`` or ``altered``.
-    """
-
-    is_taken: bool
-    problem: str = ""
-    hint: str = ""
-    cause: str = ""
-
-
-def judge_offer(taken: TakenVersion | None, offered: Current, *, accept: int = 0) -> Judgement:
-    """Decide whether the version that an origin offers is taken; until it is, the old version is served.
+def refusal_of(taken: TakenVersion | None, offered: Current, *, accept: int = 0) -> MapDataError | None:
+    """Return why the version that an origin offers is refused; None if it may be taken, or was.
 
     The first version is taken, then every version with a greater number.  The same version changes nothing.
 
@@ -208,26 +190,28 @@ def judge_offer(taken: TakenVersion | None, offered: Current, *, accept: int = 0
     ----------
     accept
         A lower number that the user accepts; 0: none.
+
+    Returns
+    -------
+    The error, whose cause is ``older`` or ``altered``.
     """
     if taken is None or offered.version > taken.version:
-        return Judgement(True)
+        return None
     when = datetime.datetime.fromtimestamp(taken.taken_s, datetime.timezone.utc)
     before = f"version {taken.version}, which was taken on {when:%Y-%m-%d at %H:%M} UTC"
     if offered.version == taken.version:
         if offered.root == taken.current.root:
-            return Judgement(False)
-        return Judgement(
-            False,
+            return None
+        return MapDataError(
             f"{taken.url} offers another map as {before}: it is not taken",
-            "a map that is published gets a number of its own: publish it again",
-            "altered",
+            cause="altered",
+            hint="a map that is published gets a number of its own: publish it again",
         )
     if offered.version == accept:
-        return Judgement(True)
-    return Judgement(
-        False,
+        return None
+    return MapDataError(
         f"{taken.url} offers version {offered.version}, older than {before}: it is not taken",
-        f"if it is meant, --accept-version {offered.version}; `shmmap versions --rollback` gives an older map"
-        " a greater number",
-        "older",
+        cause="older",
+        hint=f"if it is meant, --accept-version {offered.version}; `shmmap versions --rollback` gives an"
+        " older map a greater number",
     )

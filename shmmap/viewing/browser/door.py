@@ -22,7 +22,6 @@ from collections.abc import Callable
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
-from shmmap.errors import BadRequest, CannotStart, InstanceBusy, ShmmapError
 from shmmap.lazy_imports import needed_packages
 
 if TYPE_CHECKING:
@@ -83,52 +82,6 @@ class Door:
         return True
 
 
-def bound(host: str, port: int, *, is_fixed: bool = True) -> socket.socket:
-    """Return a socket that listens.
-
-    Parameters
-    ----------
-    is_fixed
-        Whether it has to be that port; otherwise any free one will do.
-
-    Raises
-    ------
-    InstanceBusy
-        Another program listens there.
-    BadRequest
-        This machine has no such address.
-    CannotStart
-        Listening is not permitted.
-    """
-    import errno
-
-    where = f"{host} port {port}"
-    try:
-        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        found = socket.socket(family, kind, protocol)
-    except OSError as error:
-        raise BadRequest(f"cannot listen at {where}: {error.strerror}") from error
-    try:
-        found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        found.bind(address)
-        found.listen()
-    except OSError as error:
-        found.close()
-        if error.errno == errno.EADDRINUSE and not is_fixed:
-            return bound(host, 0)
-        problem: ShmmapError
-        if error.errno == errno.EADDRINUSE:
-            problem = InstanceBusy(
-                f"another program listens at {where}", hint="stop it, or choose another port: --listen PORT"
-            )
-        elif error.errno == errno.EADDRNOTAVAIL:
-            problem = BadRequest(f"cannot listen at {where}: this machine has no such address")
-        else:
-            problem = CannotStart(f"cannot listen at {where}: {error.strerror}")
-        raise problem from error
-    return found
-
-
 def open_server(listening: socket.socket, door: Door, label: str) -> viser.ViserServer:
     """Start a viser server behind a door.
 
@@ -138,9 +91,9 @@ def open_server(listening: socket.socket, door: Door, label: str) -> viser.Viser
         viser is not installed.
     """
     with needed_packages("shmmap view --browser", together="'shmmap[view]'"):
+        import rich
         import viser
         import websockets.asyncio.server as servers
-    import rich
 
     class Server(viser.ViserServer):
         """Never asks a host of the internet to show the map to others."""

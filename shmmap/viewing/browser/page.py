@@ -34,7 +34,6 @@ MAX_PLACE_BYTES: Final = 27_000_000
 _POINTS: Final = 2.0  # millions on a page, at first
 _MOVED: Final = 0.01  # of its distance to what it turns around: the eye has moved
 _QUEUED: Final = 3  # messages that wait for the network
-_FAR_M: Final = 20_000.0
 _RED: Final = (201, 42, 42)
 _BLUE: Final = (36, 90, 168)
 _MARKER_M: Final = 4.0
@@ -252,18 +251,28 @@ class Page:
             marker: Any = scene.add_icosphere(f"{path}.at", radius=_MARKER_M / 2, color=_RED, position=at)
         else:
             marker = scene.add_mesh_simple(
-                f"{path}.at", _ARROW * _MARKER_M, _ARROW_FACES, color=_RED, side="double", flat_shading=True,
-                wxyz=_turn(client.heading), position=at,
-            )  # fmt: skip
+                f"{path}.at",
+                _ARROW * _MARKER_M,
+                _ARROW_FACES,
+                color=_RED,
+                side="double",
+                flat_shading=True,
+                wxyz=_turn(client.heading),
+                position=at,
+            )
         nodes = [marker, scene.add_label(f"{path}.name", client.name, position=at)]
         if client.box is not None:
             centre = _centre(client.box)
             nodes.append(
                 scene.add_line_segments(
-                    f"{path}.window", _ring(client.box, is_round=client.is_round), _RED,
-                    thickness=2.0, thickness_units="screen", position=(*centre, place[2] + 0.5),
+                    f"{path}.window",
+                    _ring(client.box, is_round=client.is_round),
+                    _RED,
+                    thickness=2.0,
+                    thickness_units="screen",
+                    position=(*centre, place[2] + 0.5),
                 )
-            )  # fmt: skip
+            )
         return nodes
 
     def _move(self, mark: _Mark, client: Follower, place: Place) -> None:
@@ -286,9 +295,13 @@ class Page:
             low, high = np.array(boxes[key][:3]), np.array(boxes[key][3:])
             corners = (_CORNERS * (high - low)).astype(np.float32)
             self._lines[key] = self.browser.scene.add_line_segments(
-                f"{_ROOT}/chunks/{key[0]}/{'_'.join(map(str, key[1]))}", corners[_EDGES], _BLUE,
-                thickness=1.0, thickness_units="screen", position=(low[0], low[1], low[2]),
-            )  # fmt: skip
+                f"{_ROOT}/chunks/{key[0]}/{'_'.join(map(str, key[1]))}",
+                corners[_EDGES],
+                _BLUE,
+                thickness=1.0,
+                thickness_units="screen",
+                position=(low[0], low[1], low[2]),
+            )
 
     # --- texts ----------------------------------------------------------------------------------
 

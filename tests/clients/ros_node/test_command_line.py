@@ -82,7 +82,7 @@ def test_what_it_loads_of_a_client_only_install() -> None:
         "import sys\nimport shmmap\nimport shmmap_clients.ros_node\n"
         "from shmmap_clients.ros_node import cli, point_cloud2, requests, settings, to_point_cloud2\n"
         "import shmmap_clients.command_line\nshmmap.connect\n"
-        "more = {'open3d', 'numba', 'scipy', 'rich', 'xxhash', 'yaml', 'lzf', 'sensor_msgs'}\n"
+        "more = {'open3d', 'numba', 'scipy', 'xxhash', 'yaml', 'lzf', 'sensor_msgs'}\n"
         "print(*more & set(sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=60)

@@ -15,7 +15,6 @@ from xml.etree import ElementTree
 
 import pytest
 
-from shmmap import cli
 from shmmap.cli.screens.demo import print_report, town_report
 from shmmap.demo.consumer import Pose, StepReport
 from shmmap.demo.demo import run_demo
@@ -172,16 +171,6 @@ def test_an_occupied_directory_is_refused_before_anything_is_built(tmp_path: Pat
     with pytest.raises(BadRequest, match="is not a divided map: it has mine"):
         run_demo(DemoSettings(), NothingMayBegin(), map_dir=str(tmp_path / "town"))
     assert [path.name for path in (tmp_path / "town").iterdir()] == ["mine"]
-
-
-def test_what_the_demonstration_did_before_is_named(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["demo", "--live"]) == 2
-    assert "python3 clients/examples/live_drive.py" in capsys.readouterr().err
-    assert cli.main(["demo", "--full"]) == 2
-    said = " ".join(capsys.readouterr().err.split())
-    assert "--full" in said
-    assert "python -m tests.benchmarks.memory" in said
-    assert "python -m tests.benchmarks.three_programs" in said
 
 
 class WatchedFleet(Fleet):

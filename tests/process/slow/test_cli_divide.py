@@ -67,7 +67,6 @@ def test_divide_check_and_merge(cloud: Path, tmp_path: Path) -> None:
         (["map", "--max-memory", "1M"], 2, "at least"),
         (["map", "--cell-size", "0"], 2, "cell size"),
         (["map", "--translate", "1,2"], 2, "X,Y,Z"),
-        (["map", "--order", "morton"], 2, "--order: morton: this option is gone"),
         (["cloud.pcd"], 2, "inside the output"),
     ],
 )

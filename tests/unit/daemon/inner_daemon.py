@@ -22,7 +22,7 @@ import msgspec
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.loading.link import Link
 from shmmap.daemon.loading.worker_messages import Job
-from shmmap.daemon.map_in_memory import FetchedFrom, MapInMemory
+from shmmap.daemon.map_in_memory import FROM_FILES, FetchedFrom, MapInMemory
 from shmmap.daemon.pins.watch import PinWatch
 from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.daemon.requests.map_queries import MapQueries
@@ -113,7 +113,7 @@ class InnerDaemon:
         self.stopped_at_s: float | None = None
         pins = PinWatch(self.directory, events=True)
         self.on_disk: set[str] = set()
-        fetched = FetchedFrom((), 1, link, self._needed_bytes) if link else None
+        fetched = FetchedFrom((), 1, link, self._needed_bytes) if link else FROM_FILES
         self.memory = memory = MapInMemory(
             config, self.origin.load(), self.directory, pins, "", 0o400, -1, None, fetched, clock=self.now_s
         )

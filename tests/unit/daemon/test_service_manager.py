@@ -17,8 +17,8 @@ from shmmap.daemon.service_manager import (
     EXTEND_EVERY_S,
     EXTEND_S,
     STATUS_EVERY_S,
-    MoreTime,
     ServiceManager,
+    asking_for_time,
     notify,
     status_line,
     take_activated_socket,
@@ -158,7 +158,7 @@ def test_it_asks_while_it_lasts() -> None:
             twice.set()
         return True
 
-    with MoreTime(send, "reading the map", every_s=0.0):
+    with asking_for_time(send, "reading the map", every_s=0.0):
         assert twice.wait(60.0)
     count = len(sent)
     assert set(sent) == {("STATUS=reading the map", "EXTEND_TIMEOUT_USEC=60000000")}
@@ -170,10 +170,11 @@ def test_it_asks_while_it_lasts() -> None:
 def test_what_hangs_gets_no_more_in_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shmmap.daemon.service_manager.MAX_START_S", -1.0)
     sent = Sent()
-    one = MoreTime(sent.send, "reading the map", every_s=0.0)
-    with one:
-        one._thread.join(60.0)
-        assert not one._thread.is_alive()
+    with asking_for_time(sent.send, "reading the map", every_s=0.0):
+        for thread in threading.enumerate():
+            if thread.name == "more time":
+                thread.join(60.0)
+                assert not thread.is_alive()
     assert not sent
 
 

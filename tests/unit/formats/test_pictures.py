@@ -131,11 +131,3 @@ def test_png_row_by_row() -> None:
     writer.add(np.full((1, 5), 9, np.uint8))
     writer.finish()
     assert png_pixels(file.getvalue())[:, 0].tolist() == [0, 0, 0, 9]
-
-
-def test_png_with_a_palette() -> None:
-    palette = np.random.default_rng(1).integers(0, 256, (200, 3)).astype(np.uint8)
-    pixels = np.random.default_rng(2).integers(0, 200, (6, 9)).astype(np.uint8)
-    png = png_bytes(pixels, palette.tobytes())
-    assert np.array_equal(png_pixels(png), pixels)
-    assert np.array_equal(png_pixels(png, "RGB"), palette[pixels])

@@ -15,7 +15,6 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from types import TracebackType
 from typing import Final
 
 import numpy as np
@@ -24,6 +23,7 @@ from numpy.typing import NDArray
 from shmmap import BadRequest, Cell, Client, MapWindow, NoAnswer, ShmmapError
 from shmmap.errors import InternalError
 from shmmap.layers import canonical_layer
+from shmmap_clients.closed_at_end import ClosedAtEnd
 from shmmap_clients.ndt_scan_matcher.backends.backend import UploadStatistics
 from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelCell, VoxelMap, cell_from_layer
 from shmmap_clients.spread import RunningSpread
@@ -129,7 +129,7 @@ class MapRules:
         return canonical_layer(f"ndt(leaf={self.leaf!r})")
 
 
-class MapUpdater:
+class MapUpdater(ClosedAtEnd):
     """Updater of the `VoxelMap` around a pose.
 
     Parameters
@@ -141,8 +141,6 @@ class MapUpdater:
         Called in the updater's thread with each new map, to prepare it for alignments.
     uploads
         Counts of writes to a device by ``prepare``, for the statistics: `NdtMatcher.uploads`.
-    name
-        Name of its own session in ``shmmap clients``.
     route
         Known path ahead of the vehicle, (N, 2), metres, map frame; the daemon prefetches the cells along
         it.
@@ -167,7 +165,6 @@ class MapUpdater:
         *,
         prepare: Callable[[VoxelMap], VoxelMap] = lambda voxel_map: voxel_map,
         uploads: UploadStatistics | None = None,
-        name: str = "shmmap-ndt",
         route: NDArray[np.float64] | Sequence[tuple[float, float]] = (),
     ) -> None:
         self.rules = rules if rules is not None else MapRules()
@@ -185,7 +182,7 @@ class MapUpdater:
             update_distance=0.0,  # this class decides when to ask
             refresh_interval=_REFRESH_S,
             background=False,
-            name=name,
+            name="shmmap-ndt",
         )
         self._known: dict[str, tuple[Cell, VoxelCell]] = {}
         self._latest: tuple[VoxelMap, tuple[float, float]] | None = None
@@ -198,14 +195,6 @@ class MapUpdater:
         self._busy = False
         self._thread = threading.Thread(target=self._run, name="ndt-map", daemon=True)
         self._thread.start()
-
-    def __enter__(self) -> MapUpdater:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """End the thread and its own session, if any; maps already returned stay readable."""

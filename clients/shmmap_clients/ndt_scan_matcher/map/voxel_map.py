@@ -31,7 +31,6 @@ Covariance = Literal["autoware", "pclomp", "pcl"]
 TABLE_COLUMNS: Final = 13  # addresses of lattice, mean, inverse; then the columns of `VoxelMap.boxes`
 _ADDRESSES: Final = 3
 _MAX_COLUMNS: Final = 1 << 22  # 16 MiB of directory: 2 km x 2 km at 1 m
-Inverses = dict[Covariance, NDArray[np.float64]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,7 +78,7 @@ class VoxelCell:
         return self.lattice.nbytes + self.mean.nbytes + self.inverse.nbytes
 
 
-def voxel_cell(points: NDArray[np.generic], leaf: float, *, min_points: int = 6) -> VoxelCell:
+def voxel_cell(points: NDArray[np.generic], leaf: float) -> VoxelCell:
     """Compute the Gaussians of a cloud, equal to the daemon's ``ndt`` layer.
 
     Parameters
@@ -88,8 +87,6 @@ def voxel_cell(points: NDArray[np.generic], leaf: float, *, min_points: int = 6)
         Map frame, metres; rows that are not finite are left out.
     leaf
         Edge of a voxel, metres.
-    min_points
-        Voxels with fewer points are left out.
 
     Raises
     ------
@@ -98,7 +95,7 @@ def voxel_cell(points: NDArray[np.generic], leaf: float, *, min_points: int = 6)
     """
     from shmmap.layers import build_layer
 
-    return cell_from_layer(build_layer(f"ndt(leaf={leaf!r},min_points={min_points})", points))
+    return cell_from_layer(build_layer(f"ndt(leaf={leaf!r})", points))
 
 
 def cell_from_layer(layer: LayerTable | Cell) -> VoxelCell:
@@ -151,8 +148,6 @@ class VoxelMap:
         (x, y), metres, map frame; by default the middle of all cells.
     previous
         A map whose derived covariances are reused for the cells in both maps.
-    derived
-        Precomputed inverse covariances, by a cell's key and their kind.
 
     Attributes
     ----------
@@ -174,7 +169,6 @@ class VoxelMap:
         max_bytes: int | None = None,
         centre: tuple[float, float] | None = None,
         previous: VoxelMap | None = None,
-        derived: Mapping[str, Inverses] | None = None,
     ) -> None:
         leaves = {cell.leaf for cell in cells.values()}
         if len(leaves) > 1:
@@ -187,9 +181,9 @@ class VoxelMap:
         self.voxels_left_out = sum(len(cell.count) for cell in left)
         self.bytes_left_out = sum(cell.map_bytes for cell in left)
         self.origins = np.array([cell.origin for cell in kept.values()]).reshape(-1, 3)
-        self._derived: dict[str, Inverses] = {key: dict(known) for key, known in (derived or {}).items()}
+        self._derived: dict[str, dict[Covariance, NDArray[np.float64]]] = {}
         if previous is not None:
-            self._derived |= {
+            self._derived = {
                 key: previous._derived[key]
                 for key, cell in kept.items()
                 if previous.cells.get(key) is cell and key in previous._derived

@@ -7,13 +7,13 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from types import TracebackType
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shmmap import BadRequest
+from shmmap_clients.closed_at_end import ClosedAtEnd
 from shmmap_clients.ndt_scan_matcher.backends.backend import Backend, DeviceError, UploadStatistics
 from shmmap_clients.ndt_scan_matcher.backends.registry import backend_named
 from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
@@ -85,7 +85,7 @@ class Regularization:
         )
 
 
-class NdtMatcher:
+class NdtMatcher(ClosedAtEnd):
     """Scan matcher for a map; its constructor allocates all buffers.
 
     Parameters
@@ -140,14 +140,6 @@ class NdtMatcher:
         if self._backend.max_map_bytes < self.limits.max_map_bytes:
             self.limits = replace(self.limits, map_bytes=self._backend.max_map_bytes)
         self.set_map(VoxelMap({}))
-
-    def __enter__(self) -> NdtMatcher:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """End the backend's threads."""

@@ -20,6 +20,7 @@ from shmmap.cli.screens.output import (
     print_pairs,
     print_table,
 )
+from shmmap.cli.screens.status_parts import STATE_STYLES
 
 if TYPE_CHECKING:
     from shmmap.client.live.chunk_reader import ChunkInfo
@@ -103,21 +104,12 @@ def _map_row(row: LiveMapRow) -> list[str]:
 _SHOW_EXIT = """\
 Exit code: 0, 2 when there is no such map, or 69 when no daemon answers."""
 
-_COLOURS = {
-    "clean": "green",
-    "dirty": "blue",
-    "saving": "cyan",
-    "loading": "bright_black",
-    "saved": "dim",
-}
-"""Rolling-Bonxai's colours: clean green, dirty blue, not yet loaded dark."""
-
 _CHUNK_COLUMNS = (
     Column("CHUNK"),
     Column("X", "right", spare=2),
     Column("Y", "right", spare=2),
     Column("Z", "right", spare=2),
-    Column("STATE", looks=_COLOURS),
+    Column("STATE", looks=STATE_STYLES),
     Column("KNOWN", "right"),
     Column("OCCUPIED", "right", spare=1),
     Column("FREE", "right", spare=1),

@@ -132,11 +132,16 @@ def _live_scene(
     in_memory = [chunk for chunk in chunks if chunk.state != "saved"]
     memory = format_bytes(sum(chunk.bytes for chunk in in_memory))
     scene = Scene(
-        bounds=bounds, disk=[], rows=[], clients=clients, now_ns=time.monotonic_ns(),
+        bounds=bounds,
+        disk=[],
+        rows=[],
+        clients=clients,
+        now_ns=time.monotonic_ns(),
         title=f"live map {live.name}, voxels of {live.resolution:g} m",
         note=f"{counted(len(chunks), 'chunk')}, {len(in_memory):,} of them in memory, {memory}",
-        empty=not squares, chunks=squares,
-    )  # fmt: skip
+        empty=not squares,
+        chunks=squares,
+    )
     return scene, everywhere
 
 
@@ -172,9 +177,15 @@ def _scene(
         bounds = area.bounds
         rows = [rows[index] for index in those_in(Box(*bounds), boxes)]  # bounds of everything drawn
     scene = Scene(
-        bounds=bounds, disk=disk.cells, rows=rows, clients=clients, now_ns=time.monotonic_ns(), title=title,
-        note=_note(area, found, rows, clients, disk), empty=not disk.total and not rows,
-    )  # fmt: skip
+        bounds=bounds,
+        disk=disk.cells,
+        rows=rows,
+        clients=clients,
+        now_ns=time.monotonic_ns(),
+        title=title,
+        note=_note(area, found, rows, clients, disk),
+        empty=not disk.total and not rows,
+    )
     return scene, everywhere
 
 

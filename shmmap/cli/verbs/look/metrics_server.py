@@ -3,45 +3,18 @@
 
 from __future__ import annotations
 
-import errno
-import ipaddress
 import socket
 import threading
 from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Final
 
-from shmmap.errors import BadRequest, CannotStart, InstanceBusy, ShmmapError
+from shmmap.errors import ShmmapError
 
-_HOST: Final = "127.0.0.1"
 _MAX_CONNECTIONS: Final = 16
 _SILENT_S: Final = 5.0
 _CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 _FRONT_PAGE: Final = "shmmap: metrics in Prometheus' format are at /metrics\n"
-
-
-def listen_address(text: str) -> tuple[str, int]:
-    """Parse ``9731``, ``HOST:9731`` or ``[ADDRESS]:9731``; without a host it is the loopback's.
-
-    Raises
-    ------
-    BadRequest
-        The text is no address with a port.
-    """
-    host, _, port = text.rpartition(":")
-    if host.startswith("[") or ":" in host:
-        host, is_ipv6 = host[1:-1], host.startswith("[") and host.endswith("]")
-        try:
-            ipaddress.IPv6Address(host)
-        except ValueError:
-            is_ipv6 = False
-        port = port if is_ipv6 else ""
-    if not port.isascii() or not port.isdecimal() or int(port) > 65535:
-        raise BadRequest(
-            f"{text!r} is no address to listen at",
-            hint="give a port such as 9731, HOST:9731 or [ADDRESS]:9731",
-        )
-    return host or _HOST, int(port)
 
 
 class MetricsServer(ThreadingHTTPServer):
@@ -49,42 +22,20 @@ class MetricsServer(ThreadingHTTPServer):
 
     Parameters
     ----------
-    host, port
-        Where to listen; port 0: one that is free.
+    listening
+        Socket that listens; the server closes it.
     scrape
         Function that returns the page; called in several threads.
-
-    Raises
-    ------
-    InstanceBusy
-        Another program listens there.
-    BadRequest
-        This machine has no such address.
-    CannotStart
-        Listening is not permitted.
     """
 
     daemon_threads = True
-    request_queue_size = _MAX_CONNECTIONS
 
-    def __init__(self, host: str, port: int, scrape: Callable[[], str]) -> None:
+    def __init__(self, listening: socket.socket, scrape: Callable[[], str]) -> None:
         self.scrape = scrape
         self._places = threading.BoundedSemaphore(_MAX_CONNECTIONS)
-        where = f"{host} port {port}"
-        try:
-            family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-            self.address_family = family
-            super().__init__(address[:2], _Handler)  # type: ignore[arg-type]  # host and port
-        except socket.gaierror as error:
-            raise BadRequest(f"cannot listen at {where}: {error.strerror}") from error
-        except OSError as error:
-            if error.errno == errno.EADDRINUSE:
-                raise InstanceBusy(
-                    f"another program listens at {where}", hint="stop it, or choose another port"
-                ) from error
-            if error.errno == errno.EADDRNOTAVAIL:
-                raise BadRequest(f"cannot listen at {where}: this machine has no such address") from error
-            raise CannotStart(f"cannot listen at {where}: {error.strerror}") from error
+        super().__init__(listening.getsockname()[:2], _Handler, bind_and_activate=False)
+        self.socket.close()
+        self.socket = listening
 
     @property
     def url(self) -> str:

@@ -167,7 +167,8 @@ def run_metrics(args: argparse.Namespace) -> int:
 
 def _serve_metrics(args: argparse.Namespace) -> int:
     """Answer scrapes until a signal; the daemon may come, hang and go meanwhile."""
-    from shmmap.cli.verbs.look.metrics_server import MetricsServer, listen_address
+    from shmmap.cli.listening import listen_address, listening_at
+    from shmmap.cli.verbs.look.metrics_server import MetricsServer
     from shmmap.statistics.prometheus import exposition
     from shmmap.statistics.reader import read_statistics
 
@@ -187,7 +188,7 @@ def _serve_metrics(args: argparse.Namespace) -> int:
             asked.add_to(found)
         return exposition(found, name)
 
-    server = MetricsServer(*listen_address(args.listen), scrape)
+    server = MetricsServer(listening_at(*listen_address(args.listen)), scrape)
     with server, lists(args, "shmmap metrics") as asked:
         print_line(f"serving {server.url}", flush=True)
         server.serve_forever()
@@ -251,9 +252,11 @@ def _print_findings(findings: list[Finding], *, everything: bool) -> None:
     for one in findings:
         by_state["skip" if one.skipped else one.state].append(one)
     counts = [
-        counted(len(by_state["fail"]), "problem"), counted(len(by_state["warn"]), "warning"),
-        f"{len(by_state['ok'])} ok", f"{len(by_state['skip'])} not applicable",
-    ]  # fmt: skip
+        counted(len(by_state["fail"]), "problem"),
+        counted(len(by_state["warn"]), "warning"),
+        f"{len(by_state['ok'])} ok",
+        f"{len(by_state['skip'])} not applicable",
+    ]
     verdict = worst(findings)
     print_styled([(f"{verdict}:", state_style(verdict)), (f" {', '.join(counts)}", "")])
     shown: list[tuple[str, str, Finding]] = []

@@ -25,9 +25,17 @@ if TYPE_CHECKING:
     from shmmap.viewing.sources import BoxTuple, PointSource
 
 _FROM: Final = (
-    "above", "north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west",
+    "above",
+    "north",
+    "north-east",
+    "east",
+    "south-east",
+    "south",
+    "south-west",
+    "west",
+    "north-west",
     "behind",
-)  # fmt: skip
+)
 _MAX_PIXELS: Final = 1 << 26
 _AROUND_CLIENT_M: Final = 60.0
 _BESIDE_WINDOW: Final = 0.025  # of its side
@@ -155,10 +163,19 @@ def run(args: argparse.Namespace) -> int:
 
         print_json(
             outputs.Viewed(
-                os.path.abspath(path), view.size[0], view.size[1], nbytes, drawn.points, drawn.parts,
-                list(drawn.box), drawn.metres_per_pixel, args.by, drawn.low, drawn.high,
+                os.path.abspath(path),
+                view.size[0],
+                view.size[1],
+                nbytes,
+                drawn.points,
+                drawn.parts,
+                list(drawn.box),
+                drawn.metres_per_pixel,
+                args.by,
+                drawn.low,
+                drawn.high,
             )
-        )  # fmt: skip
+        )
     else:
         shown = f"{counted(drawn.points, 'point')} of {counted(drawn.parts, source.what)}"
         print_line(f"wrote {path}: {shown}, {extent_text(_rounded(drawn.box))}")
@@ -200,15 +217,15 @@ def _check(args: argparse.Namespace) -> None:
 
 def _serve(args: argparse.Namespace) -> int:
     """Show the daemon's map to browsers until a signal."""
-    from shmmap.cli.verbs.look.metrics_server import listen_address
-    from shmmap.viewing.browser.door import Door, bound, open_server
+    from shmmap.cli.listening import listen_address, listening_at
+    from shmmap.viewing.browser.door import Door, open_server
     from shmmap.viewing.browser.live_view import LiveView
 
     area = area_from(args)
     host, port = listen_address(args.listen or str(_PORT))
     with (
         connect(args, "shmmap view") as client,
-        bound(host, port, is_fixed=args.listen is not None) as listening,
+        listening_at(host, port, is_fixed=args.listen is not None) as listening,
     ):
         if args.follow is not None:
             args.follow = _client(client.stats().sessions, args.follow).name

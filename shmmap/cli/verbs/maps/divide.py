@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING
 
 from shmmap.cli.options import Subparsers, add_cloud_options, add_json_option, add_verb, numbers, size_bytes
 from shmmap.cli.program import complain
@@ -71,11 +71,6 @@ def add_divide(subparsers: Subparsers) -> None:
         type=metres,
         default=0.0,
         help="thin out: one point, the mean, for each voxel of this side",
-    )
-    points.add_argument(
-        "--order",
-        type=_order_is_gone,
-        help=argparse.SUPPRESS,
     )
     points.add_argument(
         "--encoding",
@@ -153,13 +148,6 @@ def metres(text: str) -> float:
         return float(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"expected metres, not {text!r}") from None
-
-
-def _order_is_gone(text: str) -> NoReturn:
-    """Refuse an option that only earlier versions had."""
-    raise argparse.ArgumentTypeError(
-        f"{text}: this option is gone, leave it out; points keep the order of the input"
-    )
 
 
 def translation(text: str) -> Translation:

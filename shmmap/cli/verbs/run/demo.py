@@ -8,11 +8,11 @@ import os
 import tempfile
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from shmmap.cli.options import Subparsers, add_json_option, add_verb
 from shmmap.cli.screens.output import print_json, print_line
-from shmmap.errors import BadRequest, CannotWrite
+from shmmap.errors import CannotWrite
 
 if TYPE_CHECKING:
     from shmmap.cli.screens.demo import DemoReport
@@ -41,15 +41,6 @@ _JSON = """\
           "shm_bytes": shared memory, counted once, "total_bytes": both}
   Exit code 1 where a scan is not to be trusted."""
 
-_GONE: Final = {
-    "full": (
-        "benchmarks measure what it did",
-        "`python -m tests.benchmarks.memory` and `python -m tests.benchmarks.three_programs`",
-    ),
-    "live": ("an example maps a drive", "`python3 clients/examples/live_drive.py DIR`"),
-}
-"""Options of earlier versions: what does it now, and how."""
-
 
 def add_parser(subparsers: Subparsers) -> None:
     """Add the verb ``demo``."""
@@ -75,8 +66,6 @@ def add_parser(subparsers: Subparsers) -> None:
         type=_density,
         help="points per square metre of ground, 2 to 1000; fewer are quicker (default: 100, or what fits)",
     )
-    for option in _GONE:
-        parser.add_argument(f"--{option}", action="store_true", help=argparse.SUPPRESS)
     add_json_option(parser)
 
 
@@ -95,11 +84,6 @@ def run(args: argparse.Namespace) -> int:
     from shmmap.cli.screens.demo import print_report, progress_for
     from shmmap.processes.interrupts import signals_interrupt
 
-    for option, (message, hint) in _GONE.items():
-        if getattr(args, option):
-            raise BadRequest(
-                f"demo has no --{option} any more: {message}", hint=f"in the source tree: {hint}"
-            )
     picture = _picture_path(args.svg)
     started_s = time.monotonic()
     if not args.json:

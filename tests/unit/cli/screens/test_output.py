@@ -18,6 +18,7 @@ from shmmap.cli.screens.output import (
     print_pairs,
     print_table,
 )
+from shmmap.cli.verbs.live.served import _CHUNK_COLUMNS
 from shmmap.cli.verbs.look.status import _CLIENT_COLUMNS
 from tests.unit.cli.screens.conftest import Terminal
 
@@ -51,6 +52,14 @@ def test_table_on_a_terminal_is_styled_unless_the_environment_forbids_it(
 
 WIDE = (Column("CELL"), Column("X", "right", spare=1), Column("Y", "right", spare=1), Column("ID", spare=2))
 WIDE_ROWS = [["town_0_0.pcd", "100", "200", "0123456789abcdef"]]
+
+
+def test_chunks_of_each_state_have_a_colour(terminal: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdout", terminal)
+    states = ("clean", "dirty", "saving", "loading", "saved")
+    print_table(_CHUNK_COLUMNS, [["0_0_0", *["1"] * 3, state, *["1"] * 5] for state in states])
+    for state in states:
+        assert re.search(rf"\x1b\[[0-9]+m{state} *\x1b\[0m", terminal.getvalue()), state
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The server of metrics: addresses, its one page, errors as answers, and peers that say nothing."""
+"""The server of metrics: its one page, errors as answers, and peers that say nothing."""
 
 from __future__ import annotations
 
@@ -11,16 +11,17 @@ from collections.abc import Iterator
 
 import pytest
 
+from shmmap.cli.listening import listening_at
 from shmmap.cli.verbs.look import metrics_server
-from shmmap.cli.verbs.look.metrics_server import MetricsServer, listen_address
-from shmmap.errors import BadRequest, InstanceBusy, MapDataError
+from shmmap.cli.verbs.look.metrics_server import MetricsServer
+from shmmap.errors import MapDataError
 
 PAGE = "shmmap_up 1\n"
 
 
 @pytest.fixture
 def served() -> Iterator[MetricsServer]:
-    with MetricsServer("127.0.0.1", 0, lambda: PAGE) as server:
+    with MetricsServer(listening_at("127.0.0.1", 0), lambda: PAGE) as server:
         thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
         thread.start()
         yield server
@@ -35,29 +36,6 @@ def get(url: str, method: str = "GET") -> tuple[int, str, str]:
             return answer.status, answer.headers["Content-Type"], answer.read().decode()
     except urllib.error.HTTPError as error:
         return error.code, error.headers["Content-Type"], error.read().decode()
-
-
-@pytest.mark.parametrize(
-    ("text", "address"),
-    [
-        ("9731", ("127.0.0.1", 9731)),
-        (":9731", ("127.0.0.1", 9731)),
-        ("0", ("127.0.0.1", 0)),
-        ("0.0.0.0:80", ("0.0.0.0", 80)),
-        ("localhost:65535", ("localhost", 65535)),
-        ("[::1]:9731", ("::1", 9731)),
-    ],
-)
-def test_addresses(text: str, address: tuple[str, int]) -> None:
-    assert listen_address(text) == address
-
-
-@pytest.mark.parametrize(
-    "text", ["", "localhost", "::1:9731", "[::1]", "[x]:1", "1.2.3.4:65536", "h:-1", "h:٣"]
-)
-def test_what_is_no_address(text: str) -> None:
-    with pytest.raises(BadRequest, match="is no address to listen at"):
-        listen_address(text)
 
 
 def test_its_pages(served: MetricsServer) -> None:
@@ -101,10 +79,3 @@ def test_a_silent_peer_is_given_up(served: MetricsServer, monkeypatch: pytest.Mo
     with socket.create_connection(served.address, timeout=20) as silent:
         silent.sendall(b"GET /met")
         assert silent.recv(1) == b""
-
-
-def test_where_it_cannot_listen(served: MetricsServer) -> None:
-    with pytest.raises(InstanceBusy, match=r"another program listens at 127\.0\.0\.1 port"):
-        MetricsServer(*served.address, lambda: PAGE)
-    with pytest.raises(BadRequest, match="this machine has no such address"):
-        MetricsServer("192.0.2.1", 1, lambda: PAGE)

@@ -116,7 +116,7 @@ def test_pressure_is_published_once_a_second() -> None:
     log, subscriber = subscribed()
     pressure = PressureEvents(log, lambda: MEMORY)
     for tenth in range(25):
-        pressure.refused(f"{tenth}.pcd", "points", "over_budget", tenth / 10)
+        pressure.note_refusal(f"{tenth}.pcd", "points", "over_budget", tenth / 10)
     pressure.step(2.5)
     pressure.step(3.0)
     pressure.step(9.0)
@@ -158,7 +158,7 @@ def test_refusals_are_a_line_a_minute_with_holder_and_setting(
     pressure = PressureEvents(subscribed()[0], lambda: MEMORY, lambda: "planner (pid 7): 3.0 MiB")
     with caplog.at_level(logging.WARNING, "shmmap"):
         for step in range(700):
-            pressure.refused(f"{step}.pcd", "points", code, step / 10)
+            pressure.note_refusal(f"{step}.pcd", "points", code, step / 10)
     first, second = caplog.messages
     assert first.startswith(f"cells refused for lack of memory count=1 code={code} last=0.pcd layer=points")
     assert second.startswith(f"cells refused for lack of memory count=600 code={code} last=600.pcd")
@@ -191,19 +191,19 @@ def missed(log: EventLog) -> list[PrefetchMiss]:
 
 def test_at_most_once_a_second(log: EventLog) -> None:
     misses, (one,) = PrefetchMisses(log), clients(1)
-    assert misses.note(one, "a.pcd", "points")
-    assert misses.note(one, "b.pcd", "ndt(leaf=2.0)")
+    assert misses.note_wait(one, "a.pcd", "points")
+    assert misses.note_wait(one, "b.pcd", "ndt(leaf=2.0)")
     assert missed(log) == [], "the answer to a request is not held up"
-    misses.turn(10.0)
+    misses.publish_due(10.0)
     assert missed(log) == [
         PrefetchMiss(1, 7, 5, one.slot, one.peer.pid, "client 0", 2, "b.pcd", "ndt(leaf=2.0)")
     ]
-    misses.note(one, "c.pcd", "points")
-    misses.turn(10.0 + 0.9 * QUIET_S)
+    misses.note_wait(one, "c.pcd", "points")
+    misses.publish_due(10.0 + 0.9 * QUIET_S)
     assert len(missed(log)) == 1
-    misses.turn(10.0 + QUIET_S)
+    misses.publish_due(10.0 + QUIET_S)
     assert [(event.cells, event.id) for event in missed(log)] == [(2, "b.pcd"), (1, "c.pcd")]
-    misses.turn(10.0 + 3 * QUIET_S)
+    misses.publish_due(10.0 + 3 * QUIET_S)
     assert (len(missed(log)), len(misses)) == (2, 0)
 
 
@@ -211,38 +211,38 @@ def test_many_clients_take_turns(log: EventLog) -> None:
     """However many there are, no turn publishes more than a few events; all of them come."""
     misses, many = PrefetchMisses(log), clients(5 * MAX_EVENTS_PER_TURN)
     for session in many:
-        misses.note(session, "a.pcd", "points")
+        misses.note_wait(session, "a.pcd", "points")
     for number in range(5):
-        misses.turn(10.0)
+        misses.publish_due(10.0)
         assert len(missed(log)) == (number + 1) * MAX_EVENTS_PER_TURN
     assert {event.session for event in missed(log)} == {session.slot for session in many}
     for _ in range(5):
-        misses.turn(10.0 + QUIET_S)
+        misses.publish_due(10.0 + QUIET_S)
     assert len(misses) == 0
 
 
 def test_a_client_that_asks_again_waits_on(log: EventLog) -> None:
     misses, (one, other) = PrefetchMisses(log), clients(2)
-    assert misses.note(one, "a.pcd", "points")
-    assert not misses.note(one, "a.pcd", "points")
-    assert misses.note(one, "a.pcd", "ndt(leaf=2.0)")
-    assert misses.note(other, "a.pcd", "points")
-    misses.turn(10.0)
-    assert not misses.note(one, "a.pcd", "points")
-    misses.arrived("a.pcd", "points")
-    assert misses.note(one, "a.pcd", "points"), "it has left memory since"
-    assert not misses.note(one, "a.pcd", "ndt(leaf=2.0)")
-    misses.turn(20.0)
+    assert misses.note_wait(one, "a.pcd", "points")
+    assert not misses.note_wait(one, "a.pcd", "points")
+    assert misses.note_wait(one, "a.pcd", "ndt(leaf=2.0)")
+    assert misses.note_wait(other, "a.pcd", "points")
+    misses.publish_due(10.0)
+    assert not misses.note_wait(one, "a.pcd", "points")
+    misses.note_arrival("a.pcd", "points")
+    assert misses.note_wait(one, "a.pcd", "points"), "it has left memory since"
+    assert not misses.note_wait(one, "a.pcd", "ndt(leaf=2.0)")
+    misses.publish_due(20.0)
     assert [event.cells for event in missed(log)] == [2, 1, 1]
 
 
 def test_what_is_remembered_of_cells_that_never_come_is_bounded(log: EventLog) -> None:
     misses, many = PrefetchMisses(log), clients(MAX_WAITING_CLIENTS + 2)
     for session in many:
-        misses.note(session, "a.pcd", "points")
+        misses.note_wait(session, "a.pcd", "points")
     assert sum(map(len, misses._absent.values())) <= MAX_WAITING_CLIENTS
     for number in range(MAX_MISSED_CELLS + 5):
-        misses.note(many[0], f"{number}.pcd", "points")
+        misses.note_wait(many[0], f"{number}.pcd", "points")
     assert len(misses._absent) == MAX_MISSED_CELLS
 
 
@@ -276,12 +276,12 @@ def test_what_was_evicted_is_known_once(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr("shmmap.daemon.events.cell_events.MAX_EVICTED", 3)
     history = EvictionHistory()
     for number in range(5):
-        history.evicted(Key(f"{number}", "points"), number)
+        history.note_eviction(Key(f"{number}", "points"), number)
     assert len(history) == 3
-    assert not history.loaded(Key("0", "points"), 0)  # forgotten
-    assert history.loaded(Key("3", "points"), 3)
-    assert not history.loaded(Key("3", "points"), 3)  # it was just brought back
-    assert not history.loaded(Key("4", "points"), 99)  # it changed meanwhile
+    assert not history.take_eviction(Key("0", "points"), 0)  # forgotten
+    assert history.take_eviction(Key("3", "points"), 3)
+    assert not history.take_eviction(Key("3", "points"), 3)  # it was just brought back
+    assert not history.take_eviction(Key("4", "points"), 99)  # it changed meanwhile
 
 
 ROW = LiveMapRow(

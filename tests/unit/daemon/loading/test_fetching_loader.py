@@ -53,7 +53,7 @@ class Store(Files):
         del spec, job
         self.begun.put(number)
 
-    def done(self) -> int | None:
+    def take_done(self) -> int | None:
         os.eventfd_read(self.fd)
         return self._come.popleft()
 

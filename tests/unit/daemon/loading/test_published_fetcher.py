@@ -53,7 +53,7 @@ def begin(fetcher: ObjectFetcher, number: int, digest: bytes, monkeypatch: pytes
 
 def next_done(fetcher: ObjectFetcher) -> int | None:
     assert select.select([fetcher.fd], [], [], 60.0)[0]
-    return fetcher.done()
+    return fetcher.take_done()
 
 
 def test_objects_that_drip_hold_up_no_others(objects: Objects, monkeypatch: pytest.MonkeyPatch) -> None:

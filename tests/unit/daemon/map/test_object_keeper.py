@@ -15,6 +15,7 @@ import pytest
 from shmmap.daemon.map.object_keeper import THREADS, Kept, KeptCell, ObjectKeeper
 from shmmap.origin.remote.object_tier import KeptObjects, ObjectCounts, ObjectTier
 from shmmap.origin.remote.published_object import ObjectName, blob_path
+from shmmap.processes.request_threads import have_ended
 from tests.support.map_stores import MemoryStore
 
 TIMEOUT_MS = 60_000
@@ -57,7 +58,7 @@ class Keeper:
 def one(tmp_path: Path) -> Iterator[Keeper]:
     keeper = Keeper(tmp_path / "cache")
     yield keeper
-    assert keeper.keeper.close()
+    assert have_ended(keeper.keeper.close())
 
 
 def test_what_is_kept_is_not_fetched_again(one: Keeper) -> None:
@@ -96,7 +97,7 @@ def test_many_at_once(one: Keeper) -> None:
 def test_a_disk_without_room_is_said(tmp_path: Path) -> None:
     small = Keeper(tmp_path / "cache", limit_bytes=100)
     assert small.keep(3) == Kept(KeptCell(1, 3, "points"), False, has_no_room=True)
-    assert small.keeper.close()
+    assert have_ended(small.keeper.close())
 
 
 def test_without_a_thread_nothing_stays_pending(one: Keeper, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,6 +12,7 @@ import pytest
 
 from shmmap.daemon.map.origin_link import LinkNews, OriginLink
 from shmmap.errors import MapDataError, Offline
+from shmmap.processes.request_threads import have_ended
 from tests.support.daemon_process import Deadline
 
 
@@ -41,7 +42,7 @@ class Origin:
         return self._links[-1]
 
     def close(self) -> None:
-        assert all(link.close() for link in self._links)
+        assert all(have_ended(link.close()) for link in self._links)
 
 
 @pytest.fixture

@@ -17,6 +17,7 @@ import pytest
 from shmmap.errors import BadRequest, MapDataError
 from shmmap.geometry import Area, AutowareSquare, Box, Circle
 from shmmap.origin.catalogue import Catalogue
+from shmmap.processes.request_threads import have_ended
 from shmmap.segment.version import cell_version, layer_version
 from tests.support.daemon_process import Deadline
 from tests.support.map_stores import MemoryStore
@@ -137,7 +138,7 @@ def served() -> Iterator[Served]:
     one = Served()
     yield one
     one.store.open.set()
-    assert one.fetcher.close()
+    assert have_ended(one.fetcher.close())
 
 
 def collect(pages: ShardPages) -> tuple[list[int], list[int]]:

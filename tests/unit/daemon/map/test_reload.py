@@ -39,15 +39,15 @@ def test_the_directories_of_a_map(tmp_path: Path) -> None:
 
 
 def test_it_is_due_once_the_files_were_left_alone(watch: FileWatch, tmp_path: Path) -> None:
-    assert not watch.due(100.0)
+    assert not watch.take_change(100.0)
     (tmp_path / "a.pcd").write_bytes(b"a")
     watch.drain(100.0)
-    assert not watch.due(100.0 + SETTLE_S / 2)
+    assert not watch.take_change(100.0 + SETTLE_S / 2)
     (tmp_path / "b.pcd").write_bytes(b"b")
     watch.drain(100.0 + SETTLE_S / 2)
-    assert not watch.due(100.0 + SETTLE_S)
-    assert watch.due(100.0 + 1.5 * SETTLE_S)
-    assert not watch.due(200.0)  # once
+    assert not watch.take_change(100.0 + SETTLE_S)
+    assert watch.take_change(100.0 + 1.5 * SETTLE_S)
+    assert not watch.take_change(200.0)  # once
 
 
 def test_a_map_that_is_written_without_pause_is_read_all_the_same(watch: FileWatch, tmp_path: Path) -> None:
@@ -55,9 +55,9 @@ def test_a_map_that_is_written_without_pause_is_read_all_the_same(watch: FileWat
     while now_s < 100.0 + MAX_DELAY_S:
         (tmp_path / "a.pcd").write_bytes(b"a")
         watch.drain(now_s)
-        assert not watch.due(now_s)
+        assert not watch.take_change(now_s)
         now_s += SETTLE_S / 2
-    assert watch.due(now_s)
+    assert watch.take_change(now_s)
 
 
 CHANGES: dict[str, Callable[[Path], object]] = {
@@ -79,17 +79,17 @@ def test_changes(tmp_path: Path, how: str) -> None:
     with closing(FileWatch([str(tmp_path)])) as watch:
         CHANGES[how](tmp_path)
         watch.drain(1.0)
-        assert watch.due(2.0)
+        assert watch.take_change(2.0)
 
 
 def test_reading_is_no_change(watch: FileWatch, tmp_path: Path) -> None:
     (tmp_path / "a.pcd").write_bytes(b"a")
     watch.drain(1.0)
-    assert watch.due(2.0)
+    assert watch.take_change(2.0)
     (tmp_path / "a.pcd").read_bytes()
     os.listdir(tmp_path)
     watch.drain(3.0)
-    assert not watch.due(9.0)
+    assert not watch.take_change(9.0)
 
 
 def test_a_directory_that_may_not_be_watched_ends_nothing(watch: FileWatch, tmp_path: Path) -> None:
@@ -97,16 +97,16 @@ def test_a_directory_that_may_not_be_watched_ends_nothing(watch: FileWatch, tmp_
     odd = tmp_path / "odd"
     odd.symlink_to(odd)
     watch.follow([str(odd)])
-    assert not watch.due(1.0)
+    assert not watch.take_change(1.0)
     odd.unlink()
     watch.drain(2.0)
-    assert watch.due(3.0)
+    assert watch.take_change(3.0)
     odd.mkdir()
     watch.drain(4.0)
-    assert watch.due(5.0)
+    assert watch.take_change(5.0)
     (odd / "a.pcd").write_bytes(b"a")
     watch.drain(6.0)
-    assert watch.due(7.0)
+    assert watch.take_change(7.0)
 
 
 def test_a_directory_that_is_replaced_is_followed(tmp_path: Path) -> None:
@@ -116,23 +116,23 @@ def test_a_directory_that_is_replaced_is_followed(tmp_path: Path) -> None:
     watch = FileWatch([str(place)])
     place.rename(elsewhere)
     watch.drain(10.0)
-    assert watch.due(11.0)
+    assert watch.take_change(11.0)
     (elsewhere / "a.pcd").write_bytes(b"a")
     watch.drain(12.0)
-    assert not watch.due(13.0)
+    assert not watch.take_change(13.0)
     place.mkdir()
-    assert not watch.due(14.1), "it may be being filled"
-    assert watch.due(14.1 + SETTLE_S)
+    assert not watch.take_change(14.1), "it may be being filled"
+    assert watch.take_change(14.1 + SETTLE_S)
     (place / "a.pcd").write_bytes(b"a")
     watch.drain(15.0)
-    assert watch.due(16.0)
+    assert watch.take_change(16.0)
     watch.close()
 
 
 def test_a_full_queue_counts_as_a_change(watch: FileWatch, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(inotify.Inotify, "read", lambda _: [inotify.Event(-1, inotify.OVERFLOW, "")])
     watch.drain(1.0)
-    assert watch.due(2.0)
+    assert watch.take_change(2.0)
 
 
 def test_a_limit_of_the_kernel_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from shmmap.errors import CannotWrite
 from shmmap.origin.remote.map_versions import Current
-from shmmap.origin.remote.taken_version import Judgement, TakenVersion, TakenVersionFile, judge_offer
+from shmmap.origin.remote.taken_version import TakenVersion, TakenVersionFile, refusal_of
 
 URL = "s3://bucket/town"
 TAKEN = TakenVersion(
@@ -181,37 +181,35 @@ OTHER = "ff" * 32
 
 
 @pytest.mark.parametrize(
-    ("offered", "accept", "is_taken", "problem"),
+    ("offered", "accept", "problem"),
     [
-        (TAKEN.current, 0, False, ""),
-        (TAKEN.current, 7, False, ""),
-        (Current(8, OTHER, 9), 0, True, ""),
-        (Current(8, TAKEN.current.root, 9), 0, True, ""),
-        (Current(1 << 62, OTHER, 9), 3, True, ""),
-        (Current(7, OTHER, 9), 0, False, "offers another map as version 7, which was taken on 2027-01-15"),
-        (Current(7, OTHER, 9), 7, False, "offers another map as version 7"),
-        (
-            Current(6, OTHER, 9),
-            0,
-            False,
-            "offers version 6, older than version 7, which was taken on 2027",
-        ),
-        (Current(6, TAKEN.current.root, 9), 0, False, "offers version 6, older"),
-        (Current(6, OTHER, 9), 5, False, "offers version 6, older"),
-        (Current(6, OTHER, 9), 6, True, ""),
+        (TAKEN.current, 0, ""),
+        (TAKEN.current, 7, ""),
+        (Current(8, OTHER, 9), 0, ""),
+        (Current(8, TAKEN.current.root, 9), 0, ""),
+        (Current(1 << 62, OTHER, 9), 3, ""),
+        (Current(7, OTHER, 9), 0, "offers another map as version 7, which was taken on 2027-01-15"),
+        (Current(7, OTHER, 9), 7, "offers another map as version 7"),
+        (Current(6, OTHER, 9), 0, "offers version 6, older than version 7, which was taken on 2027"),
+        (Current(6, TAKEN.current.root, 9), 0, "offers version 6, older"),
+        (Current(6, OTHER, 9), 5, "offers version 6, older"),
+        (Current(6, OTHER, 9), 6, ""),
     ],
 )
-def test_which_offers_are_taken(offered: Current, accept: int, is_taken: bool, problem: str) -> None:
-    found = judge_offer(TAKEN, offered, accept=accept)
-    assert found.is_taken is is_taken
-    assert problem in found.problem
-    assert bool(found.problem) == bool(found.hint) == bool(problem)
-    assert not found.problem or URL in found.problem
+def test_which_offers_are_refused(offered: Current, accept: int, problem: str) -> None:
+    refused = refusal_of(TAKEN, offered, accept=accept)
+    if not problem:
+        assert refused is None
+        return
+    assert refused is not None
+    assert f"{URL} {problem}" in refused.message
+    assert refused.cause == ("altered" if "another map" in problem else "older")
+    assert refused.hint
 
 
 def test_the_first_one_is_taken_whatever_its_number() -> None:
     for offered, accept in itertools.product((Current(1, OTHER, 9), Current(1 << 62, OTHER, 9)), (0, 1, 5)):
-        assert judge_offer(None, offered, accept=accept) == Judgement(True)
+        assert refusal_of(None, offered, accept=accept) is None
 
 
 @given(offers=st.lists(st.tuples(st.integers(1, 9), st.sampled_from(["aa" * 32, "bb" * 32])), max_size=20))
@@ -219,7 +217,7 @@ def test_without_a_person_a_version_never_goes_back(offers: list[tuple[int, str]
     taken: TakenVersion | None = None
     for version, root in offers:
         before = taken
-        if judge_offer(taken, Current(version, root, 1)).is_taken:
+        if refusal_of(taken, Current(version, root, 1)) is None:
             taken = msgspec.structs.replace(TAKEN, version=version, root=root.encode())
         assert before is None or (taken is not None and taken.version >= before.version)
         if before is not None and taken is not None and taken.version == before.version:
