@@ -210,18 +210,21 @@ def _write_all_letters() -> None:
         sys.stdout.reconfigure(errors="replace")
 
 
-def _drop_output() -> None:
-    """Discard what stdout still buffers or gets, since the interpreter flushes it at exit."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+def _drop_output(stream: TextIO | None = None) -> None:
+    """Discard what stdout, or another stream, buffers or gets, since the interpreter flushes it at exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), (stream or sys.stdout).fileno())
 
 
 def complain(name: str, message: str, hint: str = "") -> None:
-    """Print an error and what can be done about it on stderr."""
+    """Print an error and what can be done about it on stderr, if it can be written."""
     from shmmap.cli.screens.output import print_line  # takes 5 ms to import: only for error messages
 
-    print_line(f"{name}: {message}", file=sys.stderr)
-    if hint:
-        print_line(f"hint: {hint}", file=sys.stderr)
+    try:
+        print_line(f"{name}: {message}", file=sys.stderr)
+        if hint:
+            print_line(f"hint: {hint}", file=sys.stderr)
+    except OSError:
+        _drop_output(sys.stderr)
 
 
 def add_allow_empty(parser: argparse.ArgumentParser) -> None:

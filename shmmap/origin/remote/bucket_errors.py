@@ -9,7 +9,15 @@ from typing import Final
 from shmmap.errors import MapMissing, Offline, ShmmapError
 from shmmap.lazy_imports import FOR_REMOTE, needed_packages
 from shmmap.origin.remote.store import NoBucket, NoTag, StoreRefused
-from shmmap.origin.remote.transport import AGAIN, BETWEEN, CREDENTIALS, is_panic, status_hint, unasked_304
+from shmmap.origin.remote.transport import (
+    AGAIN,
+    BETWEEN,
+    CREDENTIALS,
+    PROXY,
+    is_panic,
+    status_hint,
+    unasked_304,
+)
 from shmmap.origin.remote.unread_answers import MAX_UNREAD_BYTES, UNREAD
 
 with needed_packages("a map in a bucket", together=FOR_REMOTE):
@@ -39,6 +47,8 @@ _TRUE_NAMES: Final = (
         "is it a page, or compressed?",
     ),
     ("list response body", "its listing ended early", BETWEEN),
+    ("ProxyAuthRequired", "the proxy wants a user and a password", PROXY),
+    ("TunnelUn", "the proxy does not connect to it", PROXY),
     ("Parse(", "the answer is no HTTP", "is the address right, and its port?"),
     ("source: Header {", "its answer has a header that cannot be read", BETWEEN),
     ("source: Metadata {", "its answer has a header that cannot be read", BETWEEN),

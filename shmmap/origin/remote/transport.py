@@ -49,6 +49,9 @@ _PANICS: Final = ("PanicException", "RustPanic")
 BETWEEN: Final = "does a proxy between here and the store change its answers?"
 AGAIN: Final = "try again later"
 CREDENTIALS: Final = "are the credentials valid, and is the clock right?"
+PROXY: Final = (
+    "http_proxy and https_proxy name the proxy, with its user and password, and no_proxy exceptions"
+)
 _LOOK_S: Final = 0.1
 _PAGE_BYTES: Final = 64 << 10
 _PORTAL: Final = "is this the login page of a network, or another server than the map's?"
@@ -182,7 +185,7 @@ def _page(name: str, media_type: str) -> Offline:
 
 _HINTS: Final = {
     **dict.fromkeys((400, 401, 403), CREDENTIALS),
-    407: "the proxy between here and the store wants credentials: http_proxy and https_proxy can name them",
+    407: PROXY,
     **dict.fromkeys((408, 409, 425, 429), AGAIN),
     **dict.fromkeys((412, 413, 416, 431), BETWEEN),
     511: _PORTAL,

@@ -11,6 +11,7 @@ import base64
 import http.client
 import io
 import random
+import re
 import socket
 import ssl
 import threading
@@ -27,6 +28,7 @@ from shmmap.origin.remote.store import Listed, StoreRefused, StoreUrl, Tag, Time
 from shmmap.origin.remote.transport import (
     AGAIN,
     BETWEEN,
+    PROXY,
     Body,
     answer_limit_s,
     call_apart,
@@ -43,6 +45,7 @@ _PUBLIC: Final = "a web server is asked without credentials: may everybody read 
 _ADDRESS: Final = "is the address right?"
 _ELSEWHERE: Final = "only redirects to the same server are followed: name the place itself in the URL"
 _CERTIFICATE: Final = "SSL_CERT_FILE names further authorities; is the clock right?"
+_TUNNEL: Final = re.compile(r"Tunnel connection failed: ([0-9]+)")  # of `http.client`
 _IN_TARGETS: Final = "%/:=&?~#+!$,;'@()*[]"
 _PIECE_BYTES: Final = 64 << 10
 _MAX_REDIRECTS: Final = 5
@@ -371,7 +374,10 @@ class WebServer:
             raise StoreRefused(
                 f"{name}: the server's certificate is not accepted", hint=_CERTIFICATE
             ) from None
-        except OSError:
+        except OSError as error:
+            if refused := _TUNNEL.match(str(error)):
+                wants = "wants a user and a password" if refused[1] == "407" else "does not connect to it"
+                raise StoreRefused(f"{name}: the proxy {wants} (status {refused[1]})", hint=PROXY) from None
             raise _Failed(Offline(f"{name}: no answer", hint=_SILENT)) from None
         except (http.client.HTTPException, ValueError):
             raise _Failed(Offline(f"{name}: the answer is no HTTP", hint=_SILENT)) from None

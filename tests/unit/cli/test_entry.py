@@ -110,6 +110,13 @@ def test_a_full_disk_is_no_defect(words: str) -> None:
     assert done.stderr.startswith("shmmap: cannot write the output: No space left on device\nhint: ")
 
 
+@pytest.mark.parametrize(("words", "code"), [("inspect /nowhere", 66), ("nonsense", 2), ("version", 0)])
+def test_errors_that_cannot_be_written_keep_their_exit_code(words: str, code: int) -> None:
+    with open("/dev/full", "w", encoding="utf-8") as full:
+        command = [sys.executable, "-m", "shmmap.cli", *words.split()]
+        assert subprocess.run(command, stdout=subprocess.DEVNULL, stderr=full, check=False).returncode == code
+
+
 def test_closed_streams_are_no_defect() -> None:
     command = f"{sys.executable} -m shmmap.cli"
     done = subprocess.run(

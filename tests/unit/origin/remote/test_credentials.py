@@ -177,7 +177,7 @@ def test_google_and_azure(home: Path) -> None:
 @pytest.mark.parametrize("line", ["\ufeff{}={}", "export {}={}", '{} = "{}"', "{}='{}'\r"])
 def test_files_as_editors_and_shells_write_them(home: Path, line: str) -> None:
     lines = (line.format("AZURE_STORAGE_ACCOUNT_NAME", "a"), line.format("AZURE_STORAGE_SAS_TOKEN", SECRET))
-    (home / "shmmap.azure").write_text("\n".join(lines[:1] + (lines[1].lstrip("\ufeff"),)))
+    (home / "shmmap.azure").write_text("\n".join((lines[0], lines[1].lstrip("\ufeff"))))
     given = {"CREDENTIALS_DIRECTORY": str(home)}
     assert azure(given) == {"account_name": "a", "sas_key": SECRET}
     profile(home / ".aws/credentials")
