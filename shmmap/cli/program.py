@@ -111,6 +111,7 @@ def exit_code_of(name: str, run: Callable[[], int]) -> int:
     """Run a program and return its exit code; print its errors on stderr."""
     _open_what_is_closed()
     _write_all_letters()
+    _outlive_full_stderr()
     watch(CompilingLines(name))
     _show_warnings(name)
     try:
@@ -210,21 +211,52 @@ def _write_all_letters() -> None:
         sys.stdout.reconfigure(errors="replace")
 
 
+class _Stderr(io.TextIOWrapper):
+    """Stderr that discards what does not fit: a full disk with a log of progress must not end the work."""
+
+    before: TextIO  # the stream that it replaces, which would close the file
+
+    def write(self, text: str) -> int:
+        try:
+            return super().write(text)
+        except OSError as error:
+            self._drop_if_full(error)
+            return len(text)
+
+    def flush(self) -> None:
+        try:
+            super().flush()
+        except OSError as error:
+            self._drop_if_full(error)
+
+    def _drop_if_full(self, error: OSError) -> None:
+        if error.errno not in _FULL:
+            raise error
+        _drop_output(self)
+
+
+def _outlive_full_stderr() -> None:
+    """Make stderr a `_Stderr`, unless it was replaced already, as by tests."""
+    before = sys.stderr
+    if type(before) is io.TextIOWrapper:
+        sys.stderr = made = _Stderr(
+            before.buffer, encoding=before.encoding, errors=before.errors, line_buffering=True
+        )
+        made.before = before
+
+
 def _drop_output(stream: TextIO | None = None) -> None:
     """Discard what stdout, or another stream, buffers or gets, since the interpreter flushes it at exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), (stream or sys.stdout).fileno())
 
 
 def complain(name: str, message: str, hint: str = "") -> None:
-    """Print an error and what can be done about it on stderr, if it can be written."""
+    """Print an error and what can be done about it on stderr."""
     from shmmap.cli.screens.output import print_line  # takes 5 ms to import: only for error messages
 
-    try:
-        print_line(f"{name}: {message}", file=sys.stderr)
-        if hint:
-            print_line(f"hint: {hint}", file=sys.stderr)
-    except OSError:
-        _drop_output(sys.stderr)
+    print_line(f"{name}: {message}", file=sys.stderr)
+    if hint:
+        print_line(f"hint: {hint}", file=sys.stderr)
 
 
 def add_allow_empty(parser: argparse.ArgumentParser) -> None:

@@ -49,6 +49,7 @@ _PANICS: Final = ("PanicException", "RustPanic")
 BETWEEN: Final = "does a proxy between here and the store change its answers?"
 AGAIN: Final = "try again later"
 CREDENTIALS: Final = "are the credentials valid, and is the clock right?"
+NO_TLS: Final = "is the port right? For plain http, the address begins with http://"
 PROXY: Final = (
     "http_proxy and https_proxy name the proxy, with its user and password, and no_proxy exceptions"
 )

@@ -28,6 +28,7 @@ from shmmap.origin.remote.store import Listed, StoreRefused, StoreUrl, Tag, Time
 from shmmap.origin.remote.transport import (
     AGAIN,
     BETWEEN,
+    NO_TLS,
     PROXY,
     Body,
     answer_limit_s,
@@ -374,6 +375,10 @@ class WebServer:
             raise StoreRefused(
                 f"{name}: the server's certificate is not accepted", hint=_CERTIFICATE
             ) from None
+        except ssl.SSLError as error:
+            if isinstance(error, ssl.SSLEOFError):
+                raise _Failed(Offline(f"{name}: no answer", hint=_SILENT)) from None
+            raise StoreRefused(f"{name}: the answer is no TLS", hint=NO_TLS) from None
         except OSError as error:
             if refused := _TUNNEL.match(str(error)):
                 wants = "wants a user and a password" if refused[1] == "407" else "does not connect to it"

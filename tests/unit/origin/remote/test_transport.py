@@ -326,6 +326,17 @@ def test_a_proxy_that_does_not_connect_is_no_silence(
     assert "the proxy does not connect to it" in outcome(partial(open_store(url, timeouts=ONCE).get, "m", 99))
 
 
+@pytest.mark.parametrize("scheme", ["http", "s3"])
+def test_plain_http_at_the_other_end_is_no_silence(
+    web: FaultyWeb, monkeypatch: pytest.MonkeyPatch, scheme: str
+) -> None:
+    web.fault = lambda _path: "no HTTP"
+    tls = web.url.replace("http://", "https://")
+    monkeypatch.setenv("AWS_ENDPOINT_URL", tls)
+    store = open_store("s3://maps/m" if scheme == "s3" else f"{tls}/m", timeouts=ONCE)
+    assert "the answer is no TLS" in outcome(partial(store.get, "CURRENT", 99))
+
+
 @pytest.mark.parametrize("endpoint", ["127.0.0.1:9000", "https://", "http://[bad", "ftp://host"])
 def test_an_address_that_is_no_url_is_refused(monkeypatch: pytest.MonkeyPatch, endpoint: str) -> None:
     monkeypatch.setenv("AWS_ENDPOINT_URL", endpoint)
