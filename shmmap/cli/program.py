@@ -21,6 +21,7 @@ from shmmap.cli.compiling_lines import CompilingLines
 from shmmap.compile_notices import watch
 from shmmap.errors import CannotWrite, InternalError, ShmmapError, ShmmapWarning
 from shmmap.formats.durable_file import writing_errors
+from shmmap.private_directory import open_output
 
 _EXIT_INTERRUPTED: Final = 130  # 128 + SIGINT, as in a shell
 
@@ -334,5 +335,10 @@ def output_file(text: str) -> Path:
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file; raise `CannotWrite` if that fails."""
-    with writing_errors(str(path)):
-        path.write_text(text, encoding="utf-8")
+    write_bytes(path, text.encode())
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write a file; raise `CannotWrite` if that fails, or another account has made a link of that name."""
+    with writing_errors(str(path)), open(open_output(path), "wb") as file:
+        file.write(data)
