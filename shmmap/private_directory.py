@@ -173,6 +173,7 @@ def require_private(path: str | os.PathLike[str], *, make: int = PRIVATE, refuse
         As `open_private`.
     """
     path = os.path.abspath(path)
+    refuse_planted_above(path)
     if make:
         os.makedirs(os.path.dirname(path), mode=0o755, exist_ok=True)
     with opened_private(path, make=make, refused=refused):
@@ -215,6 +216,14 @@ def refuse_planted(path: str | os.PathLike[str]) -> None:
         is_plain = stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)
         if not is_plain and status.st_uid not in (0, os.geteuid()):
             raise NotPrivate(path, f"is a link, a pipe or a device of user {status.st_uid}")
+
+
+def refuse_planted_above(path: str | os.PathLike[str]) -> None:
+    """Raise `NotPrivate` if another account has made a link in place of a directory above a path."""
+    path = os.path.abspath(path)
+    while (above := os.path.dirname(path)) != path:
+        refuse_planted(above)
+        path = above
 
 
 def open_output(path: str | os.PathLike[str]) -> int:

@@ -177,10 +177,10 @@ def _system(node: _Node) -> CoordinateSystem | None:
         return inner[0] if inner else None
     units = _units(node)
     if node.keyword in _HEIGHT:
-        height = units[0] if units else None
+        unit = units[0] if units else None
         if any("down" in map(str.lower, axis.words) for axis in node.all(_AXIS)):
-            height = LengthUnit("units of depth", 0.0)
-        return CoordinateSystem(name=name, height=height, epsg=epsg)
+            unit = LengthUnit("units of depth", 0.0)
+        return CoordinateSystem(name=name, height=unit, epsg=epsg)
     cartesian = any("cartesian" in map(str.lower, part.words) for part in node.all(frozenset(("CS",))))
     if node.keyword in _DEGREES or (node.keyword in _GEODETIC and not cartesian):
         of_heights = [unit for axis in node.all(_AXIS) for unit in axis.all(frozenset(("LENGTHUNIT",)))]
@@ -188,10 +188,10 @@ def _system(node: _Node) -> CoordinateSystem | None:
         return CoordinateSystem(name=name, geographic=True, height=height, epsg=epsg)
     if node.keyword in _PLANE or node.keyword in _GEODETIC:
         height = units[2] if len(units) > 2 else None
-        plane = units[0] if units else None
+        of_plane = units[0] if units else None
         if len({*units[:2]}) > 1:
-            plane = LengthUnit(" and ".join(unit.name for unit in units[:2]), 0.0)
-        return CoordinateSystem(name=name, plane=plane, height=height, epsg=epsg)
+            of_plane = LengthUnit(" and ".join(unit.name for unit in units[:2]), 0.0)
+        return CoordinateSystem(name=name, plane=of_plane, height=height, epsg=epsg)
     return None
 
 
@@ -334,8 +334,8 @@ def system_in_text(text: str) -> CoordinateSystem | None:
         return CoordinateSystem("", geographic, None if geographic else plane, height) if is_known else None
     for code in map(int, _EPSG_CODE.findall(text)):
         if code in _GEOGRAPHIC_CODES or any(code in codes for codes in _STATE_PLANES):
-            plane = None if code in _GEOGRAPHIC_CODES else _state_plane_unit(code)
-            return CoordinateSystem("", plane is None, plane, epsg=code)
+            unit = None if code in _GEOGRAPHIC_CODES else _state_plane_unit(code)
+            return CoordinateSystem("", unit is None, unit, epsg=code)
     return None
 
 
@@ -371,8 +371,11 @@ def degrees_warning(lowest: NDArray[np.float64], highest: NDArray[np.float64]) -
     They do if x and y are valid longitudes and latitudes and span few degrees, while heights span many times
     as much: a town is 0.05 degrees wide and 50 m high.
     """
+    import numpy as np
+
     x, y = (max(abs(low), abs(high)) for low, high in zip(lowest[:2], highest[:2], strict=True))
-    spans = highest - lowest
+    with np.errstate(over="ignore"):
+        spans = highest - lowest
     wide = max(spans[:2])
     possible = x <= 180.0 and y <= 90.0 and max(x, y) > _OFF_ORIGIN and 0.0 < wide <= _MAX_DEGREES
     if not (possible and spans[2] > _FLATNESS * wide and all(map(math.isfinite, spans))):

@@ -380,7 +380,7 @@ def system_of_comments(comments: Iterable[str]) -> CoordinateSystem | None:
 
 def scale_notes(comments: Iterable[str]) -> tuple[str, ...]:
     """Return notes of scales that comments state; whether to multiply or to divide is not known."""
-    notes = {}
+    notes: dict[str, None] = {}
     for text in comments:
         for clause in (text, *re.split(r"[,;.]\s", text)):
             found = _SCALE.match(clause.lower())

@@ -14,6 +14,8 @@ from shmmap.cli.program import write_text
 from shmmap.dividing.workspace import Workspace
 from shmmap.errors import CannotWrite, InstanceBusy
 from shmmap.formats.durable_file import appearing_file, writing_errors
+from shmmap.layers.disk_cache import LayerCache
+from shmmap.origin.remote.object_tier import ObjectTier
 from shmmap.origin.remote.opened_store import DirectoryStore
 from shmmap.origin.remote.taken_version import TakenVersion, TakenVersionFile
 from shmmap.private_directory import (
@@ -123,6 +125,21 @@ def test_outputs_do_not_follow_what_another_account_has_planted(
         assert "see who made it" in refused.value.hint
     assert sorted(tmp_path.rglob("*")) == sorted([*before, place])
     assert not victim.is_file() or not victim.read_text()
+
+
+@pytest.mark.root
+def test_nothing_is_made_below_a_link_of_another_account(tmp_path: Path, victim: Path) -> None:
+    """State, caches and kernels in a directory that the environment names, such as one in /tmp."""
+    (tmp_path / "place").symlink_to(victim)
+    os.chown(tmp_path / "place", OTHER_USER, OTHER_USER, follow_symlinks=False)
+    before = sorted(victim.rglob("*"))
+    with pytest.raises(NotPrivate, match="is a link, a pipe or a device"):
+        require_private(tmp_path / "place" / "shmmap" / "origins")
+    cache = str(tmp_path / "place" / "shmmap")
+    assert not ObjectTier(cache, limit_bytes=1 << 20, quiet=True).put(bytes(32), b"x")
+    with pytest.raises(CannotWrite, match="is a link, a pipe or a device"):
+        LayerCache(cache, limit_bytes=1 << 20).make()
+    assert sorted(victim.rglob("*")) == before
 
 
 @pytest.mark.parametrize("output", OUTPUTS)
