@@ -68,7 +68,7 @@ _VARIABLE_CHUNKS: Final = 0xFFFFFFFF
 _NEWEST: Final = (1, 4)
 _NEWEST_FORMAT: Final = 10
 _SCALE_RANGE: Final = (1e-12, 1e6)
-_EXACT: Final = 2.0**53  # steps of the scale that float64 tells apart
+_FARTHEST: Final = 2.0**70  # scales; so far away, points 2**17 scales apart have one place in float64
 _SCALED: Final = 0x08  # flag of an extra dimension
 _LEGACY_FORMATS: Final = 6  # point formats below this have the legacy count, too
 
@@ -205,7 +205,7 @@ class _Header:
         values = _SCALES.unpack_from(self.head, 131)
         low, high = _SCALE_RANGE
         for place, value in enumerate(values):
-            least, most = (low, high) if place < 3 else (0.0, abs(values[place - 3]) * _EXACT)
+            least, most = (low, high) if place < 3 else (0.0, abs(values[place - 3]) * _FARTHEST)
             if not least <= abs(value) <= most:
                 axis, what = "xyz"[place % 3], ("offset" if place >= 3 else "scale")
                 message = f"the {what} of {axis} is {value:g}: no point has a place"
