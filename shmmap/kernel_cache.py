@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Final
 
 from shmmap.logfmt import log
-from shmmap.private_directory import PRIVATE, NotPrivate, opened_private, why_not_own
+from shmmap.private_directory import PRIVATE, NotPrivate, opened_private, refuse_planted_above, why_not_own
 from shmmap.version import __version__
 
 _MAGIC: Final = b"SHMMAPK\x01"
@@ -41,6 +41,7 @@ def kernel_directory() -> Path | None:
     """Return the directory of compiled kernels, created if missing; None, logged once, if unusable."""
     try:
         path = _place()
+        refuse_planted_above(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         with _opened(path, make=PRIVATE):
             return path

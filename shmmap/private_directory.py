@@ -24,6 +24,7 @@ CLOSED: Final = 0o077
 """Permissions that others may not have: none at all."""
 
 _OPEN: Final = "may be"
+_MAX_LINKS: Final = 40  # as in the kernel
 DIRECTORY_FLAGS: Final = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
@@ -172,6 +173,7 @@ def require_private(path: str | os.PathLike[str], *, make: int = PRIVATE, refuse
         As `open_private`.
     """
     path = os.path.abspath(path)
+    refuse_planted_above(path)
     if make:
         os.makedirs(os.path.dirname(path), mode=0o755, exist_ok=True)
     with opened_private(path, make=make, refused=refused):
@@ -190,15 +192,53 @@ def open_followed(path: str) -> int:
 
 
 def _followed(path: str | os.PathLike[str]) -> str:
-    """Return where a link of this user or of root leads, else the path itself."""
-    fd = os.open(path, os.O_PATH | os.O_NOFOLLOW | os.O_CLOEXEC)
-    try:
-        status = os.fstat(fd)
-        if not stat.S_ISLNK(status.st_mode) or status.st_uid not in (0, os.geteuid()):
-            return os.fspath(path)
-        return os.path.join(os.path.dirname(path), os.readlink("", dir_fd=fd))
-    finally:
-        os.close(fd)
+    """Return where links of this user or of root lead, else the path itself."""
+    path = os.fspath(path)
+    for _ in range(_MAX_LINKS):
+        fd = os.open(path, os.O_PATH | os.O_NOFOLLOW | os.O_CLOEXEC)
+        try:
+            status = os.fstat(fd)
+            if not stat.S_ISLNK(status.st_mode) or status.st_uid not in (0, os.geteuid()):
+                break
+            path = os.path.join(os.path.dirname(path), os.readlink("", dir_fd=fd))
+        finally:
+            os.close(fd)
+    return path
+
+
+def refuse_planted(path: str | os.PathLike[str]) -> None:
+    """Raise `NotPrivate` if another account has made a link, a pipe or a device in place of an output.
+
+    Links and pipes of this user or of root are meant, such as ``/dev/stdout``.
+    """
+    with contextlib.suppress(FileNotFoundError):
+        status = os.lstat(path)
+        is_plain = stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)
+        if not is_plain and status.st_uid not in (0, os.geteuid()):
+            raise NotPrivate(path, f"is a link, a pipe or a device of user {status.st_uid}")
+
+
+def refuse_planted_above(path: str | os.PathLike[str]) -> None:
+    """Raise `NotPrivate` if another account has made a link in place of a directory above a path."""
+    path = os.path.abspath(path)
+    while (above := os.path.dirname(path)) != path:
+        refuse_planted(above)
+        path = above
+
+
+def open_output(path: str | os.PathLike[str]) -> int:
+    """Open a file to write, emptied, and return its descriptor.
+
+    Raises
+    ------
+    NotPrivate
+        See `refuse_planted`.
+    OSError
+        It cannot be opened.
+    """
+    refuse_planted(path)
+    follow = 0 if os.path.islink(path) else os.O_NOFOLLOW
+    return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC | follow, 0o666)
 
 
 def within(fd: int, name: str = "") -> str:

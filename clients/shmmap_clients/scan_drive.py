@@ -15,7 +15,14 @@ from pathlib import Path
 from typing import Any, Protocol, TextIO, TypeVar
 
 from shmmap import BadRequest
-from shmmap_clients.command_line import ProgressLine, complain, nothing_found, print_line, writing_errors
+from shmmap_clients.command_line import (
+    ProgressLine,
+    complain,
+    nothing_found,
+    open_output,
+    print_line,
+    writing_errors,
+)
 from shmmap_clients.scans.bag import Bag, is_bag, split_moment
 from shmmap_clients.scans.bag_scans import BagOptions, BagScans, scan_at
 from shmmap_clients.scans.scan_file import ScanReader
@@ -111,7 +118,7 @@ class ScanDrive:
     def open_text(self, path: str) -> TextIO:
         """Open a file for writing until the end; errors of writing raise `CannotWrite`."""
         with writing_errors(path):
-            file = open(path, "w", encoding="utf-8")  # noqa: SIM115
+            file = open(open_output(path), "w", encoding="utf-8")  # noqa: SIM115
         self._stack.enter_context(writing_errors(path))
         return self._stack.enter_context(file)
 

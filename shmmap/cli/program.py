@@ -21,6 +21,7 @@ from shmmap.cli.compiling_lines import CompilingLines
 from shmmap.compile_notices import watch
 from shmmap.errors import CannotWrite, InternalError, ShmmapError, ShmmapWarning
 from shmmap.formats.durable_file import writing_errors
+from shmmap.private_directory import open_output
 
 _EXIT_INTERRUPTED: Final = 130  # 128 + SIGINT, as in a shell
 
@@ -111,6 +112,7 @@ def exit_code_of(name: str, run: Callable[[], int]) -> int:
     """Run a program and return its exit code; print its errors on stderr."""
     _open_what_is_closed()
     _write_all_letters()
+    _outlive_full_stderr()
     watch(CompilingLines(name))
     _show_warnings(name)
     try:
@@ -210,9 +212,43 @@ def _write_all_letters() -> None:
         sys.stdout.reconfigure(errors="replace")
 
 
-def _drop_output() -> None:
-    """Discard what stdout still buffers or gets, since the interpreter flushes it at exit."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+class _Stderr(io.TextIOWrapper):
+    """Stderr that discards what does not fit: a full disk with a log of progress must not end the work."""
+
+    before: TextIO  # the stream that it replaces, which would close the file
+
+    def write(self, text: str) -> int:
+        try:
+            return super().write(text)
+        except OSError as error:
+            self._drop_if_full(error)
+            return len(text)
+
+    def flush(self) -> None:
+        try:
+            super().flush()
+        except OSError as error:
+            self._drop_if_full(error)
+
+    def _drop_if_full(self, error: OSError) -> None:
+        if error.errno not in _FULL:
+            raise error
+        _drop_output(self)
+
+
+def _outlive_full_stderr() -> None:
+    """Make stderr a `_Stderr`, unless it was replaced already, as by tests."""
+    before = sys.stderr
+    if type(before) is io.TextIOWrapper:
+        sys.stderr = made = _Stderr(
+            before.buffer, encoding=before.encoding, errors=before.errors, line_buffering=True
+        )
+        made.before = before
+
+
+def _drop_output(stream: TextIO | None = None) -> None:
+    """Discard what stdout, or another stream, buffers or gets, since the interpreter flushes it at exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), (stream or sys.stdout).fileno())
 
 
 def complain(name: str, message: str, hint: str = "") -> None:
@@ -299,5 +335,10 @@ def output_file(text: str) -> Path:
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file; raise `CannotWrite` if that fails."""
-    with writing_errors(str(path)):
-        path.write_text(text, encoding="utf-8")
+    write_bytes(path, text.encode())
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write a file; raise `CannotWrite` if that fails, or another account has made a link of that name."""
+    with writing_errors(str(path)), open(open_output(path), "wb") as file:
+        file.write(data)

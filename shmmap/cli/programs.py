@@ -13,8 +13,9 @@ These names, their parameters and their behaviour are stable; the rest of `shmma
     Return a `shmmap.Client` of the daemon selected by those options or by ``SHMMAP_*`` variables.
 `at_least`, `seconds`, `output_file`
     Types of options: whole numbers, durations, output files (refused at once if not writable).
-`write_text`, `writing_errors`
-    Write a file; raise `shmmap.errors.CannotWrite` if that fails.
+`write_text`, `open_output`, `writing_errors`
+    Write a file, or open one, not through another account's link; raise `shmmap.errors.CannotWrite` if that
+    fails.
 `counted`, `format_bytes`
     Return ``"1,200 points"`` or ``"4.1 MiB"``, as all screens have it.
 `print_json`, `print_line`, `printable`
@@ -45,6 +46,7 @@ from shmmap.cli.program import (
 )
 from shmmap.cli.screens.output import counted, format_bytes, print_json, print_line, printable
 from shmmap.formats.durable_file import writing_errors
+from shmmap.private_directory import open_output
 
 __all__ = [
     "Parser",
@@ -60,6 +62,7 @@ __all__ = [
     "format_bytes",
     "join_negative_values",
     "nothing_found",
+    "open_output",
     "output_file",
     "print_json",
     "print_line",

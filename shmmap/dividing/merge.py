@@ -28,7 +28,7 @@ from shmmap.errors import BadRequest, MapDataError
 from shmmap.formats.durable_file import appearing_file, writing_errors
 from shmmap.formats.pcd.writer import pcd_header, pcd_rows
 from shmmap.formats.point_checks import LasChecks
-from shmmap.origin.map_report import read_report
+from shmmap.origin.map_report import REPORT_NAME, UNKNOWN_FRAME, frame_of, read_report
 from shmmap.progress import NoProgress, Progress
 
 MERGED_ENCODINGS: Final = ("binary", "ascii")
@@ -160,8 +160,15 @@ def _check_output(out: str, encoding: str, *, force: bool) -> None:
 def _origin_of(path: str) -> _Move:
     """Return the offset to add to an input's points: the origin of a divided map, else zero."""
     report = read_report(path) if os.path.isdir(path) else None
-    x, y, z = report["origin"] if report is not None else NO_MOVE
-    return x, y, z
+    if report is None:
+        return NO_MOVE
+    if (frame := frame_of(report)) is UNKNOWN_FRAME:
+        raise MapDataError(
+            f"the origin in its {REPORT_NAME} is none",
+            path=path,
+            hint="--keep-frame leaves points as they are",
+        )
+    return frame.origin
 
 
 def _check_metres(source: Source) -> None:

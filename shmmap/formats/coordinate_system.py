@@ -177,7 +177,10 @@ def _system(node: _Node) -> CoordinateSystem | None:
         return inner[0] if inner else None
     units = _units(node)
     if node.keyword in _HEIGHT:
-        return CoordinateSystem(name=name, height=units[0] if units else None, epsg=epsg)
+        unit = units[0] if units else None
+        if any("down" in map(str.lower, axis.words) for axis in node.all(_AXIS)):
+            unit = LengthUnit("units of depth", 0.0)
+        return CoordinateSystem(name=name, height=unit, epsg=epsg)
     cartesian = any("cartesian" in map(str.lower, part.words) for part in node.all(frozenset(("CS",))))
     if node.keyword in _DEGREES or (node.keyword in _GEODETIC and not cartesian):
         of_heights = [unit for axis in node.all(_AXIS) for unit in axis.all(frozenset(("LENGTHUNIT",)))]
@@ -185,7 +188,10 @@ def _system(node: _Node) -> CoordinateSystem | None:
         return CoordinateSystem(name=name, geographic=True, height=height, epsg=epsg)
     if node.keyword in _PLANE or node.keyword in _GEODETIC:
         height = units[2] if len(units) > 2 else None
-        return CoordinateSystem(name=name, plane=units[0] if units else None, height=height, epsg=epsg)
+        of_plane = units[0] if units else None
+        if len({*units[:2]}) > 1:
+            of_plane = LengthUnit(" and ".join(unit.name for unit in units[:2]), 0.0)
+        return CoordinateSystem(name=name, plane=of_plane, height=height, epsg=epsg)
     return None
 
 
@@ -285,7 +291,7 @@ def geokey_system(directory: bytes, doubles: bytes, text: bytes) -> CoordinateSy
     if not geographic:
         plane = _coded(numbers, _PROJECTED_UNIT, _PROJECTED_UNIT_SIZE) or _coded(numbers, _GEOG_UNIT)
     if plane is None and any(projected in codes for codes in _STATE_PLANES):
-        plane = FEET["ft" if projected in _STATE_PLANES_FT else "us-ft"]
+        plane = _state_plane_unit(projected)
     if plane is None and not geographic and (metres := _by_name(" ".join(names[:2]))):
         plane = _length(names[0] or names[1], metres)
     return CoordinateSystem(
@@ -306,6 +312,48 @@ def _coded(numbers: dict[int, float], key: int, size_key: int = 0) -> LengthUnit
     return _UNIT_CODES.get(code, LengthUnit(f"unit EPSG:{code}", 0.0))
 
 
+# --- text --------------------------------------------------------------------------------------------
+
+_WKT_AT: Final = re.compile(
+    rf"\b(?:{'|'.join(sorted(_PLANE | _DEGREES | _GEODETIC | _HEIGHT | _COMPOUND | _AROUND))})\s*[\[(]", re.I
+)
+_PROJ: Final = re.compile(r"\+(proj|units|to_meter|vunits|vto_meter)=([^\s\"'+]+)")
+_EPSG_CODE: Final = re.compile(r"\bEPSG[\s:/]+(?:[0-9.]*[:/])?([0-9]{4,5})\b", re.I)
+_GEOGRAPHIC_CODES: Final = (4258, 4267, 4269, 4283, 4326, 4490, 4612, 4937, 4979, 6318, 6668, 7844)
+
+
+def system_in_text(text: str) -> CoordinateSystem | None:
+    """Return the system that a comment names, as far as units follow from it: WKT, PROJ or an EPSG code."""
+    if found := _WKT_AT.search(text):
+        return wkt_system(text[found.start() :])
+    if fields := dict(_PROJ.findall(text)):
+        plane = _proj_unit(fields.get("to_meter"), fields.get("units"))
+        height = _proj_unit(fields.get("vto_meter"), fields.get("vunits"))
+        geographic = fields.get("proj") in ("longlat", "latlong", "lonlat", "latlon")
+        is_known = geographic or plane is not None or height is not None
+        return CoordinateSystem("", geographic, None if geographic else plane, height) if is_known else None
+    for code in map(int, _EPSG_CODE.findall(text)):
+        if code in _GEOGRAPHIC_CODES or any(code in codes for codes in _STATE_PLANES):
+            unit = None if code in _GEOGRAPHIC_CODES else _state_plane_unit(code)
+            return CoordinateSystem("", unit is None, unit, epsg=code)
+    return None
+
+
+def _proj_unit(metres: str | None, name: str | None) -> LengthUnit | None:
+    if metres is not None:
+        over, _, under = metres.partition("/")
+        try:
+            return _length("", float(over) / float(under or 1))
+        except (ValueError, ZeroDivisionError):
+            return LengthUnit(metres, 0.0)
+    known = {"m": METRE, "km": LengthUnit("kilometre", 1000.0), **LENGTHS}
+    return None if name is None else known.get(name, LengthUnit(name, 0.0))
+
+
+def _state_plane_unit(code: int) -> LengthUnit:
+    return FEET["ft" if code in _STATE_PLANES_FT else "us-ft"]
+
+
 GEOGRAPHIC_SYSTEM: Final = (
     "its coordinate system is geographic: x and y are degrees, not metres; convert it to a metric "
     "system first,"
@@ -323,8 +371,11 @@ def degrees_warning(lowest: NDArray[np.float64], highest: NDArray[np.float64]) -
     They do if x and y are valid longitudes and latitudes and span few degrees, while heights span many times
     as much: a town is 0.05 degrees wide and 50 m high.
     """
+    import numpy as np
+
     x, y = (max(abs(low), abs(high)) for low, high in zip(lowest[:2], highest[:2], strict=True))
-    spans = highest - lowest
+    with np.errstate(over="ignore"):
+        spans = highest - lowest
     wide = max(spans[:2])
     possible = x <= 180.0 and y <= 90.0 and max(x, y) > _OFF_ORIGIN and 0.0 < wide <= _MAX_DEGREES
     if not (possible and spans[2] > _FLATNESS * wide and all(map(math.isfinite, spans))):

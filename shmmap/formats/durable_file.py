@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from typing import IO, Final
 
 from shmmap.errors import CannotWrite, ShmmapError
+from shmmap.private_directory import refuse_planted
 
 _LOCK_FLAGS: Final = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 _ELSEWHERE: Final = "choose a directory that this user may write to"
@@ -40,9 +41,11 @@ def appearing_file(path: str | os.PathLike[str], *, replace: bool = True) -> Ite
     FileExistsError
         A file of that name exists, and ``replace`` is False.
     OSError
-        The file cannot be written; nothing is left behind.
+        The file cannot be written, or another account has made a link in place of the directory; nothing is
+        left behind.
     """
     directory, name = os.path.split(path)
+    refuse_planted(directory or ".")
     interim = os.path.join(directory, f".{name}.{secrets.token_hex(4)}.tmp")
     try:
         with open(interim, "xb") as file:

@@ -37,6 +37,7 @@ _WKT, _GEOKEYS, _GEODOUBLES, _GEOTEXTS = 2112, 34735, 34736, 34737
 _LASZIP: Final = (b"laszip encoded", 22204)
 _EXTRA_BYTES: Final = (b"LASF_Spec", 4)
 _DIMENSION_BYTES: Final = 192  # one dimension in the Extra Bytes record
+_SCALES_AT: Final = 112  # in it
 _TYPE_BYTES: Final = (1, 1, 2, 2, 4, 4, 8, 8, 4, 8)  # of types 1 to 10; 11 to 20 are pairs, 21 to 30 triples
 _TYPES: Final = 30
 _NAMES: Final = (
@@ -64,6 +65,11 @@ _MAX_CHUNKS: Final = (
 _CHUNK_BYTES: Final = 1 << 14
 _SHOWN: Final = 8  # names in a warning
 _VARIABLE_CHUNKS: Final = 0xFFFFFFFF
+_NEWEST: Final = (1, 4)
+_NEWEST_FORMAT: Final = 10
+_SCALE_RANGE: Final = (1e-12, 1e6)
+_FARTHEST: Final = 2.0**70  # scales; so far away, points 2**17 scales apart have one place in float64
+_SCALED: Final = 0x08  # flag of an extra dimension
 _LEGACY_FORMATS: Final = 6  # point formats below this have the legacy count, too
 
 
@@ -136,8 +142,13 @@ class _Header:
             raise self._error("bad_las", "not a LAS file: it does not start with LASF", 0)
         if len(head) < _SHORTEST_BYTES:
             raise self._error("truncated", "the file ends within its header", len(head))
+        version = head[24], head[25]
+        if not (1, 0) <= version <= _NEWEST:
+            raise self._error("bad_las", f"LAS {version[0]}.{version[1]}; 1.0 to 1.4 are read", 24)
         header_bytes, data_at, records = _START.unpack_from(head, 94)
         form, record_bytes, legacy = _POINTS.unpack_from(head, 104)
+        if form & 0x3F > _NEWEST_FORMAT:
+            raise self._error("bad_las", f"point format {form & 0x3F}; 0 to {_NEWEST_FORMAT} are read", 104)
         waveforms = extended_at = extended = 0
         long: int | None = None
         if head[25] >= 4 and len(head) >= _LONG_AT + 8:
@@ -192,8 +203,10 @@ class _Header:
 
     def _check_scales(self) -> None:
         values = _SCALES.unpack_from(self.head, 131)
+        low, high = _SCALE_RANGE
         for place, value in enumerate(values):
-            if not math.isfinite(value) or (place < 3 and value == 0):
+            least, most = (low, high) if place < 3 else (0.0, abs(values[place - 3]) * _FARTHEST)
+            if not least <= abs(value) <= most:
                 axis, what = "xyz"[place % 3], ("offset" if place >= 3 else "scale")
                 message = f"the {what} of {axis} is {value:g}: no point has a place"
                 raise self._error("bad_las", message, 131 + 8 * place)
@@ -305,7 +318,14 @@ class _Header:
             elif size:
                 end = used
                 names.add(name)
-                usable += one[:4] + name.encode().ljust(32, b"\0") + one[36:]
+                options = one[3]
+                scales = struct.unpack_from(f"<{1 + (kind - 1) // 10}d", one, _SCALES_AT)
+                if options & _SCALED and not all(math.isfinite(scale) and scale for scale in scales):
+                    options &= ~_SCALED
+                    self.warnings.append(
+                        f"extra dimension {name!r} has scale {scales[0]:g}, which is ignored"
+                    )
+                usable += one[:3] + bytes([options]) + name.encode().ljust(32, b"\0") + one[36:]
                 if renamed:
                     self.warnings.append(f"an extra dimension has no name of its own: it is {name!r} here")
         if left_out:

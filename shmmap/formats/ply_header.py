@@ -19,7 +19,7 @@ from shmmap.errors import BadRequest, MapDataError
 from shmmap.formats.coordinate_system import CoordinateSystem
 from shmmap.formats.pcd.fields import AXES, MAX_FIELDS, PcdField
 from shmmap.formats.source_file import refusal
-from shmmap.formats.stated_units import decoded, system_of_comments
+from shmmap.formats.stated_units import decoded, scale_notes, system_of_comments
 
 HEADER_LIMIT_BYTES: Final = 1 << 20
 """Maximum length of a header in bytes."""
@@ -160,7 +160,7 @@ class _Parser:
             last=place == len(self.elements) - 1,
             data_offset=data_offset,
             bare_cr=bare_cr,
-            warnings=tuple(self.warnings),
+            warnings=(*self.warnings, *scale_notes(self.comments)),
             crs=system_of_comments(self.comments),
         )
         self._check_size(header)

@@ -98,11 +98,12 @@ class LasChecks(PointChecks):
 # --- text -----------------------------------------------------------------------------------------------
 
 _STEPS: Final = (100_000.0, 10_000.0, 1000.0, 100.0, 10.0, 1.0, 0.5)
+_NO_HEIGHT: Final = (-9999.0, -99999.0, -32768.0)
 _MANY: Final = 100  # points; fewer may lie on a lattice by chance
 
 
 class TextChecks(PointChecks):
-    """Extents of coordinates whose columns are guessed, rows of zeros, and rounding.
+    """Extents of coordinates whose columns are guessed, rows of zeros, heights that are none, and rounding.
 
     ``unit_m`` are metres per unit of x and y, and of z.
     """
@@ -120,6 +121,7 @@ class TextChecks(PointChecks):
             return
         self._count("points", len(finite))
         self._count("zeros", int(np.count_nonzero(~finite.any(axis=1))))
+        self._count("no_height", int(np.count_nonzero(np.isin(finite[:, 2], _NO_HEIGHT))))
         counts = self.counts
         for axis, values in zip("xyz", finite.T, strict=True):
             counts[f"low_{axis}"] = min(counts.get(f"low_{axis}", math.inf), float(values.min()))
@@ -137,6 +139,9 @@ class TextChecks(PointChecks):
             notes.append(
                 f"{zeros:,} points are at exactly (0, 0, 0), as scanners write what they did not see"
             )
+        if no_height := int(counts.get("no_height", 0)):
+            values = " or ".join(f"{value:g}" for value in _NO_HEIGHT)
+            notes.append(f"{no_height:,} points have a z of {values}, as tables write what is not known")
         if points > 1 and self._guessed:
             flat = [axis for axis in "xyz" if counts[f"low_{axis}"] == counts[f"high_{axis}"]]
             if flat:

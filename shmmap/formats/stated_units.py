@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 
-from shmmap.formats.coordinate_system import LENGTHS, METRE, CoordinateSystem, LengthUnit
+from shmmap.formats.coordinate_system import LENGTHS, METRE, CoordinateSystem, LengthUnit, system_in_text
 
 DEGREE: Final = LengthUnit("degree", 0.0)
 _UNSTATED: Final = LengthUnit("a unit that the header does not state", 0.0)
@@ -127,7 +127,7 @@ def _taken_apart(name: str) -> list[_Name]:
         base, inner = found.groups()
         # of several brackets, as in `X(East) [m]`, one may be a unit
         parts = [inner, *re.split(r"[\[\](){}<>]+", inner)]
-        unit = next((unit for part in parts if (unit := named_unit(part))), None)
+        unit = next((unit for part in parts if (unit := named_unit(part) or _multiple_of(part))), None)
         return [_Name(way.base, unit or way.unit, "" if unit else inner) for way in _taken_apart(base)]
     ways = [_Name(_common(text), None)]
     for between in _BETWEEN.finditer(text):
@@ -253,14 +253,29 @@ _QUANTITY: Final = (
     rf"|x[ ,]*y[ ,]*(?:and )?z|{_HEIGHT})(?![a-z])[\s_\-]*|(?:length|linear|distance|coordinate)(?=unit))"
 )
 _VERB: Final = r"(?:(?:are|is|all|used|given|stored|saved|written|exported|measured|expressed|recorded)\s+)*"
-_OPEN: Final = r"[\s:=,\[(\"']*"
+_OPEN: Final = r"[\s:=,>\[(\"']*"
+_UNIT_WORD: Final = r"(?:units?|(?:ma(?:ß|ss))?einheit(?:en)?|unit[ée]s?|unidad(?:es)?)"
 _BY_UNIT: Final = re.compile(
-    rf"\W*(?:1\s+)?(?P<what>{_QUANTITY}*)units?[\s_\-]*{_QUANTITY}*{_VERB}(?:in\s+)?{_OPEN}(?P<unit>.*)"
+    rf"\W*(?:1\s+)?(?P<what>{_QUANTITY}*)(?:in\s+)?{_UNIT_WORD}[\s_\-]*(?:of\s+)?{_QUANTITY}*{_VERB}(?:in\s+)?"
+    rf"{_OPEN}(?P<unit>.*)"
 )
-_BY_IN: Final = re.compile(rf"\W*(?P<what>{_QUANTITY}*){_VERB}(?:in\b|[\[(])[\s:]*(?P<unit>.*)")
+_BY_IN: Final = re.compile(rf"\W*(?P<what>{_QUANTITY}*){_VERB}(?:(?:in|as)\b|[\[(])[\s:]*(?P<unit>.*)")
+_BY_DATUM: Final = re.compile(
+    r"\W*(?P<what>vertical)\s+(?:datum|reference|crs)\b.*?(?P<unit>\([^()]*\)|[^\s,(]+)$"
+)
 _BY_COLON: Final = re.compile(rf"\W*(?P<what>{_QUANTITY}+){_VERB}{_OPEN}(?P<unit>.*)")
-_UNIT_WORDS: Final = re.compile(r"[a-zµμ\"'°]+(?:[ _\-]+[a-z]+){0,3}")
-_NUMBER: Final = re.compile(r"([0-9]*\.?[0-9]+(?:e[+-]?[0-9]+)?)\s*(?=[a-zµμ])")
+_UNIT_WORDS: Final = re.compile(r"[a-zµμ\"'°]+(?:[ _\-(]+[a-z]+){0,3}")
+_NUMBER_TEXT: Final = r"[0-9]*\.?[0-9]+(?:e[+-]?[0-9]+)?"
+_NUMBER: Final = re.compile(rf"({_NUMBER_TEXT})\s*(?=[a-zµμ])")
+_PER_UNIT: Final = re.compile(
+    rf"\W*(?:met(?:re|er)s?[\s_\-]*per[\s_\-]*unit\W*(?P<metres>{_NUMBER_TEXT})"
+    rf"|units?[\s_\-]*per[\s_\-]*met(?:re|er)\W*(?P<units>{_NUMBER_TEXT}))\W*$"
+)
+_SCALE: Final = re.compile(
+    rf"\W*(?:(?:global|coordinates?|units?|xyz|[xyz])[\s_\-]*)?scal(?:e|ing)(?:[\s_\-]*(?:factor|xyz|[xyz]))?"
+    rf"[\s:=\[(]+(?P<scale>{_NUMBER_TEXT})"
+    rf"|.*\b(?:scaled|multiplied|divided)\s+by\s+(?P<by>{_NUMBER_TEXT})"
+)
 _CLOSING: Final = " .;:!\"'()[]{}<>"
 
 Units: TypeAlias = tuple[LengthUnit, LengthUnit] | None
@@ -273,6 +288,11 @@ def units_in_comments(comments: Iterable[str]) -> tuple[LengthUnit | None, Lengt
     """
     stated: tuple[list[LengthUnit], list[LengthUnit]] = ([], [])
     for text in comments:
+        if system := system_in_text(text):
+            plane, height = system.units
+            stated[0].append(DEGREE if system.geographic else plane)
+            stated[1].append(height)
+            continue
         named = coordinates_of(split_names(text))
         if named and named.crs and not named.crs.geographic and _UNSTATED not in named.crs.units:
             for units, unit in zip(stated, named.crs.units, strict=True):
@@ -289,10 +309,18 @@ def units_in_comments(comments: Iterable[str]) -> tuple[LengthUnit | None, Lengt
 
 def _stated_by(clause: str, *, whole: bool) -> Iterator[tuple[str, LengthUnit, LengthUnit]]:
     """Yield what a clause is about, and the units of plane and height that it states."""
-    if found := _BY_UNIT.match(clause):
-        if units := _three(found["unit"]) or _multiple(found["unit"]) or _first(found["unit"]):
+    if (found := _BY_DATUM.match(clause)) and (unit := _whole_unit(found["unit"])):
+        yield found["what"], unit, unit
+    elif found := _PER_UNIT.match(clause):
+        metres = float(found["metres"] or 0.0) or 1.0 / float(found["units"] or 0.0)
+        unit = METRE if metres == 1.0 else LengthUnit(f"units of {metres:g} metre", metres)
+        yield "", unit, unit
+    elif found := _BY_UNIT.match(clause):
+        if units := _three(found["unit"]) or _twice(
+            _multiple_of(found["unit"]) or _first_unit(found["unit"])
+        ):
             yield found["what"], *units
-    elif (found := _BY_IN.match(clause)) and (units := _first(found["unit"])):
+    elif (found := _BY_IN.match(clause)) and (units := _twice(_first_unit(found["unit"]))):
         yield found["what"], *units
     elif (found := _BY_COLON.match(clause)) and (unit := _whole_unit(found["unit"])):
         yield found["what"], unit, unit
@@ -311,27 +339,25 @@ def _three(text: str) -> Units:
     return (axes[0] if axes[0] == axes[1] else _UNSTATED, axes[2]) if len(axes) == 3 else None
 
 
-def _multiple(text: str) -> Units:
-    """Return the unit, for plane and height, that is a number of another."""
+def _multiple_of(text: str) -> LengthUnit | None:
+    """Return the unit that is a number of another."""
     number = _NUMBER.match(text)
     unit = _whole_unit(text[number.end() :]) if number else None
     if number is None or unit is None or not unit.metres:
         return None
     factor = float(number.group(1))
-    made = unit if factor == 1 else LengthUnit(f"units of {factor:g} {unit.name}", factor * unit.metres)
-    return made, made
+    return unit if factor == 1 else LengthUnit(f"units of {factor:g} {unit.name}", factor * unit.metres)
 
 
-def _first(text: str) -> Units:
-    """Return the unit, for plane and height, that a text begins with."""
-    unit = _first_unit(text)
+def _twice(unit: LengthUnit | None) -> Units:
+    """Return a unit for plane and height."""
     return (unit, unit) if unit else None
 
 
 def _first_unit(text: str) -> LengthUnit | None:
     """Return the unit that a text begins with."""
     found = _UNIT_WORDS.match(text)
-    words = re.split(r"[ _\-]+", found.group()) if found else []
+    words = re.split(r"[ _\-(]+", found.group()) if found else []
     for end in range(len(words), 0, -1):
         joined = "".join(words[:end])
         if unit := named_unit(joined) or named_unit(joined.rstrip("\"'")):
@@ -350,3 +376,15 @@ def system_of_comments(comments: Iterable[str]) -> CoordinateSystem | None:
     """Return the units that comments state, as the units of a coordinate system; None if they state none."""
     plane, height = units_in_comments(comments)
     return _system(plane, plane, height) if plane or height else None
+
+
+def scale_notes(comments: Iterable[str]) -> tuple[str, ...]:
+    """Return notes of scales that comments state; whether to multiply or to divide is not known."""
+    notes: dict[str, None] = {}
+    for text in comments:
+        for clause in (text, *re.split(r"[,;.]\s", text)):
+            found = _SCALE.match(clause.lower())
+            scale = found["scale"] or found["by"] if found else "1"
+            if float(scale) != 1.0:
+                notes[f"a comment states a scale of {scale}, which is not applied"] = None
+    return tuple(notes)

@@ -27,6 +27,7 @@ from shmmap.formats.source_file import FileReader, refusal
 from shmmap.formats.stated_units import (
     coordinates_of,
     decoded,
+    scale_notes,
     split_names,
     system_of_comments,
     units_in_comments,
@@ -231,9 +232,9 @@ class _Lines:
                 raise self._error("bad_header", "the first line is not the number of points", start)
             layout = self._of_row(text, start)
             layout.announced = announced
-            self._name(
-                layout, [decoded(comment) for comment in comments], decoded(named), named_at, decoded(units)
-            )
+            texts = [decoded(comment) for comment in comments]
+            self._name(layout, texts, decoded(named), named_at, decoded(units))
+            layout.warnings += scale_notes(texts)
             return layout
         if self.file_bytes > len(self.head):
             raise self._error("bad_row", f"no row of numbers within {len(self.head)} bytes", 0)
@@ -310,6 +311,8 @@ class _Lines:
             self._check_first(rows, layout.data_at)
         if others and (odd := _odd_first(rows)):
             warnings.append(f"the first column {odd}: if it is no coordinate, {NAME_THEM}")
+        if others >= 3 and not names_of_others and len(rows) >= _FEW and _are_shares(rows[:, :3]):
+            warnings.append(f"columns 1 to 3 lie within 0 and 1: if they are a colour, {NAME_THEM}")
         if not names_of_others:
             names_of_others = [f"column_{place}" for place in range(4, count + 1)]
         layout.names = [*AXES, *names_of_others]
@@ -345,8 +348,7 @@ class _Lines:
 
     def _are_colours(self, values: NDArray[np.float64]) -> bool:
         """Whether three columns can be a colour; in a file that says so by its name, up to 1, too."""
-        floats = self.suffix == ".xyzrgb" and ((values >= 0) & (values <= 1)).all()
-        return bool(floats) or _are_bytes(values)
+        return (self.suffix == ".xyzrgb" and _are_shares(values)) or _are_bytes(values)
 
 
 def _odd_first(rows: NDArray[np.float64]) -> str:
@@ -364,6 +366,10 @@ def _odd_first(rows: NDArray[np.float64]) -> str:
 
 def _are_bytes(values: NDArray[np.float64]) -> bool:
     return bool(((values >= 0) & (values <= 255) & (values % 1 == 0)).all())
+
+
+def _are_shares(values: NDArray[np.float64]) -> bool:
+    return bool(((values >= 0) & (values <= 1)).all())
 
 
 def _are_normals(rows: NDArray[np.float64]) -> bool:

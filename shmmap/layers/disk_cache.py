@@ -32,7 +32,7 @@ from shmmap.disk_budget import INTERIM, LAYERS, DiskBudget, mark_used
 from shmmap.errors import CannotWrite, SegmentCorrupt
 from shmmap.layers.sources import CellJob
 from shmmap.layers.spec import LayerSpec
-from shmmap.private_directory import opened_private, why_not_own, within
+from shmmap.private_directory import opened_private, refuse_planted_above, why_not_own, within
 from shmmap.segment.header import checked_blocks, pack_header, read_page, unpack_header
 from shmmap.segment.layout import LAYOUT_VERSION, SegmentHeader, SourceStamp, header_size
 from shmmap.segment.writer import write_all
@@ -98,6 +98,7 @@ class LayerCache:
     def _opened(self, *, make: bool = False) -> contextlib.AbstractContextManager[int]:
         """Open the directory for one operation; it must be this account's or root's, and closed to others."""
         if make:
+            refuse_planted_above(self.directory)
             with contextlib.suppress(FileExistsError):  # no directory, as the next line says
                 os.makedirs(os.path.dirname(self.directory), mode=_MODE, exist_ok=True)
         return opened_private(self.directory, make=_MODE if make else 0, or_root=True)

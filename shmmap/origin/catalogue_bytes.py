@@ -47,7 +47,7 @@ from shmmap.errors import MapDataError
 from shmmap.logfmt import log
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.spatial_index import Grid, GridFrame, MadeOfBoxes
-from shmmap.private_directory import why_not_own
+from shmmap.private_directory import refuse_planted_above, why_not_own
 
 _MAGIC: Final = b"SHMMAPCT"
 _VERSION: Final = 2
@@ -367,6 +367,7 @@ def save_sidecar(
     if newest > scanned_ns - _SETTLED_NS:
         return False
     try:
+        refuse_planted_above(path)
         os.makedirs(os.path.dirname(path), mode=0o700, exist_ok=True)
         with tempfile.NamedTemporaryFile(
             dir=os.path.dirname(path), prefix=".catalogue-", delete=False

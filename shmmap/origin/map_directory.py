@@ -34,6 +34,7 @@ from shmmap.origin.map_layout import (
     absolute_path,
     divided_beside,
     find_layout,
+    other_metadata,
     yaml_files,
 )
 from shmmap.origin.map_report import read_map_frame
@@ -168,8 +169,9 @@ class MapDirectory:
             data = metadata_bytes(layout.metadata, max_bytes, at=opened.at(layout.metadata))
         files = scan(layout.root, recursive=not self.strict, at=opened.at)
         if not len(files.names):
+            unusable = f" that can be read: {'; '.join(files.problems)}" if files.problems else ""
             raise MapMissing(
-                f"there is no PCD file in {layout.root}",
+                f"there is no PCD file in {layout.root}{unusable}",
                 hint="a divided map is a directory of PCD files; `shmmap divide` makes one of other clouds",
             )
         if layout.metadata is None:
@@ -180,6 +182,8 @@ class MapDirectory:
         entries = parse_metadata(data, path=layout.metadata, strict=self.strict)
         del data  # with ten million cells it is the largest table of all
         catalogue = _joined(layout, layout.metadata, files, entries, strict=self.strict)
+        if self.metadata is None and (others := other_metadata(layout.root, layout.metadata, opened)):
+            catalogue.problems += (f"{layout.metadata} is read, not {' or '.join(others)}",)
         if len(catalogue) >= self.cached_from_cells and os.path.isdir(opened.at(layout.root)):
             sources += [Source.of(path, status) for path, status in files.directories.items()]
             save_sidecar(sidecar, key, sources, catalogue, scanned_ns)

@@ -22,6 +22,7 @@ state are read through these descriptors: no link on the path can mix two maps. 
 from __future__ import annotations
 
 import contextlib
+import filecmp
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -195,6 +196,19 @@ def find_layout(path: str, metadata: str | None, opened: OpenedDirectories | Non
     if metadata is None and os.path.isdir(opened.at(path)):
         metadata = _find_metadata(path, root, opened)
     return MapLayout(root, metadata)
+
+
+def other_metadata(root: str, metadata: str, opened: OpenedDirectories) -> list[str]:
+    """Return files beside and among the cells that could be the map's metadata, too, and differ from it."""
+    candidates = (
+        os.path.join(folder, name) for folder in (os.path.dirname(root), root) for name in _METADATA_NAMES
+    )
+    return [
+        path
+        for path in candidates
+        if os.path.isfile(opened.at(path))
+        and not filecmp.cmp(opened.at(path), opened.at(metadata), shallow=False)
+    ]
 
 
 def _find_metadata(path: str, root: str, opened: OpenedDirectories) -> str | None:

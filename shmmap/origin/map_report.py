@@ -48,11 +48,12 @@ class MapFrame(msgspec.Struct, frozen=True):
     unit_m: tuple[float, float] = (1.0, 1.0)
 
 
+_FARTHEST_M: Final = 1e12
 UNKNOWN_FRAME: Final = MapFrame()
 """Frame of a map without a report: that of its files."""
 
 
-def _frame_of(report: dict[str, Any]) -> MapFrame:
+def frame_of(report: dict[str, Any]) -> MapFrame:
     """Return the frame that a report describes; missing or malformed values get their defaults."""
     try:
         frame = msgspec.convert(
@@ -60,7 +61,8 @@ def _frame_of(report: dict[str, Any]) -> MapFrame:
         )
     except msgspec.ValidationError:
         return UNKNOWN_FRAME
-    if not all(map(math.isfinite, (*frame.origin, *frame.unit_m))) or min(frame.unit_m) <= 0:
+    is_sound = all(abs(part) < _FARTHEST_M for part in frame.origin)
+    if not (is_sound and all(0 < unit < math.inf for unit in frame.unit_m)):
         return UNKNOWN_FRAME
     return frame
 
@@ -74,7 +76,7 @@ def read_map_frame(directory: str | os.PathLike[str]) -> MapFrame:
         report = read_report(directory)
     except MapDataError:
         report = None
-    return UNKNOWN_FRAME if report is None else _frame_of(report)
+    return UNKNOWN_FRAME if report is None else frame_of(report)
 
 
 def read_report(map_dir: str | os.PathLike[str]) -> dict[str, Any] | None:

@@ -38,6 +38,7 @@ _INTEGER = re.compile(r"[-+]?(?:0[xX][0-9a-fA-F]+|0[0-7]*|[1-9][0-9]*)")
 _FLOAT = re.compile(r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
 _INT32 = range(-(2**31), 2**31)
 _RESOLUTIONS = (b"x_resolution", b"y_resolution")
+_FARTHEST_M = 1e12
 _FLUSH_ENTRIES = 1 << 14
 _NAMED_IN_PROBLEMS = 3
 _MAX_DIGITS = 64
@@ -54,11 +55,11 @@ def _read_corner(text: str, *, strict: bool) -> float | None:
         digits = text.lstrip("+-")
         base = 16 if digits[:2] in ("0x", "0X") else 8 if digits.startswith("0") else 10
         value = int(digits, base) * (-1 if text.startswith("-") else 1)
-        return float(value) if not strict or value in _INT32 else None
+        return float(value) if value in _INT32 or (not strict and abs(value) < _FARTHEST_M) else None
     if strict or not _FLOAT.fullmatch(text):
         return None
     number = float(text)
-    return number if math.isfinite(number) else None
+    return number if abs(number) < _FARTHEST_M else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +104,7 @@ class EntryCollector:
                 self.report("unknown key ignored", key)
             return not self.strict
         value = float(text) if _FLOAT.fullmatch(text) else math.nan
-        if not (math.isfinite(value) and value > 0):
+        if not 0 < value < _FARTHEST_M:
             return False
         self.resolutions[key] = value
         return True

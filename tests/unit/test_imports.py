@@ -62,7 +62,7 @@ PARTS = {
     "installed": {"errors"},
     "processes": {"installed"},
     "geometry": {"errors"},
-    "formats": {"errors", "columns", "geometry", "logfmt", "processes"},
+    "formats": {"errors", "columns", "geometry", "logfmt", "private_directory", "processes"},
     "segment": {"errors", "columns", "geometry", "failpoints", "lazy_imports", "mounts"},
     "protocol": {"errors", "columns", "geometry", "private_directory"},
     "kernel_cache": {"logfmt", "private_directory", "version"},

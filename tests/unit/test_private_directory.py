@@ -5,12 +5,17 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 
+from shmmap.cli.program import write_text
 from shmmap.dividing.workspace import Workspace
 from shmmap.errors import CannotWrite, InstanceBusy
+from shmmap.formats.durable_file import appearing_file, writing_errors
+from shmmap.layers.disk_cache import LayerCache
+from shmmap.origin.remote.object_tier import ObjectTier
 from shmmap.origin.remote.opened_store import DirectoryStore
 from shmmap.origin.remote.taken_version import TakenVersion, TakenVersionFile
 from shmmap.private_directory import (
@@ -84,6 +89,71 @@ def test_what_others_may_have_planted_is_refused_by_name(
     assert why in wrong.value.message
     assert hint in wrong.value.hint
     assert (victim / "map" / "mine").read_text() == "mine"
+
+
+def write_below(path: Path) -> None:
+    with writing_errors(str(path)), appearing_file(path / "file") as file:
+        file.write(b"x")
+
+
+OUTPUTS: dict[str, Callable[[Path], object]] = {
+    "text": lambda path: write_text(path, "x"),
+    "file in it": write_below,
+    "store": lambda path: DirectoryStore(str(path)).put("blobs/a", b"x"),
+}
+
+
+@pytest.mark.root
+@pytest.mark.parametrize("output", OUTPUTS)
+@pytest.mark.parametrize("kind", ["link", "link to nothing", "pipe"])
+def test_outputs_do_not_follow_what_another_account_has_planted(
+    tmp_path: Path, victim: Path, output: str, kind: str
+) -> None:
+    if output == "text":
+        victim = victim / "lock"
+    before = sorted(tmp_path.rglob("*"))
+    place = tmp_path / "out"
+    if kind == "pipe":
+        os.mkfifo(place)
+    else:
+        place.symlink_to(victim if kind == "link" else tmp_path / "new")
+    os.chown(place, OTHER_USER, OTHER_USER, follow_symlinks=False)
+    with pytest.raises(CannotWrite) as refused:
+        OUTPUTS[output](place)
+    if not (output == "store" and kind != "link"):  # it is no directory
+        assert f"is a link, a pipe or a device of user {OTHER_USER}" in refused.value.message
+        assert "see who made it" in refused.value.hint
+    assert sorted(tmp_path.rglob("*")) == sorted([*before, place])
+    assert not victim.is_file() or not victim.read_text()
+
+
+@pytest.mark.root
+def test_nothing_is_made_below_a_link_of_another_account(tmp_path: Path, victim: Path) -> None:
+    """State, caches and kernels in a directory that the environment names, such as one in /tmp."""
+    (tmp_path / "place").symlink_to(victim)
+    os.chown(tmp_path / "place", OTHER_USER, OTHER_USER, follow_symlinks=False)
+    before = sorted(victim.rglob("*"))
+    with pytest.raises(NotPrivate, match="is a link, a pipe or a device"):
+        require_private(tmp_path / "place" / "shmmap" / "origins")
+    cache = str(tmp_path / "place" / "shmmap")
+    assert not ObjectTier(cache, limit_bytes=1 << 20, quiet=True).put(bytes(32), b"x")
+    with pytest.raises(CannotWrite, match="is a link, a pipe or a device"):
+        LayerCache(cache, limit_bytes=1 << 20).make()
+    assert sorted(victim.rglob("*")) == before
+
+
+@pytest.mark.parametrize("output", OUTPUTS)
+def test_outputs_follow_a_link_of_this_user(tmp_path: Path, output: str) -> None:
+    (tmp_path / "there").mkdir()
+    target = tmp_path / "there" / "file" if output == "text" else tmp_path / "there"
+    (tmp_path / "between").symlink_to(target)
+    (tmp_path / "out").symlink_to("between")
+    OUTPUTS[output](tmp_path / "out")
+    assert [path.name for path in (tmp_path / "there").iterdir()] == [
+        "blobs" if output == "store" else "file"
+    ]
+    with opened_private(tmp_path / "out", own_link=True) if output == "store" else nullcontext():
+        pass  # through both links
 
 
 def test_a_directory_is_made_for_this_user_alone(tmp_path: Path) -> None:

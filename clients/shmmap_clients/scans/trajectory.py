@@ -22,6 +22,7 @@ _SPARSE_S: Final = 30.0  # poses further apart are not those of a drive
 _APART: Final = 100.0  # units are 1000 apart, times of clocks far less
 _LONGEST_STEP: Final = 2.0  # of seconds
 _SHORTEST_STEP: Final = 2e3  # of microseconds: 500 poses a second
+_LARGEST: Final = 1e20  # above times in nanoseconds
 _COUNTED: Final = 1e6  # no drive has more frames
 _LYING: Final = math.cos(math.radians(60.0))
 _UPRIGHT: Final = math.cos(math.radians(20.0))
@@ -224,7 +225,7 @@ def read_trajectory(path: str | os.PathLike[str]) -> Trajectory:
             values = [float(word) for word in text.split()]
         except ValueError:
             values = []
-        good = len(values) == 8 and all(math.isfinite(value) for value in values)
+        good = len(values) == 8 and all(abs(value) < _LARGEST for value in values)
         if not good or abs(math.hypot(*values[4:]) - 1.0) > _NORM_TOLERANCE:
             raise MapDataError(f"{name}, line {number}: not `t tx ty tz qx qy qz qw`", cause="trajectory")
         stamps.append(values[0])
@@ -309,14 +310,15 @@ def read_route(path: str | os.PathLike[str]) -> NDArray[np.float64]:
         words = [word.strip() for word in text.split(",")]
         if columns is None:
             names = [word.strip('"').lower() for word in words]
-            columns = (names.index("x"), names.index("y")) if {"x", "y"} <= {*names} else (0, 1)
-            if "x" in names:
+            columns = (0, 1)
+            if {"x", "y"} <= {*names}:
+                columns = (names.index("x"), names.index("y"))
                 continue
         try:
             place = float(words[columns[0]]), float(words[columns[1]])
         except (ValueError, IndexError):
             place = (np.nan, np.nan)
-        if not np.isfinite(place).all():
+        if not all(abs(value) < _LARGEST for value in place):
             raise MapDataError(f"{name}, line {number}: not `x,y`", cause="route")
         places.append(place)
     if not places:

@@ -10,6 +10,7 @@ import contextlib
 import fcntl
 import os
 import re
+import stat
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final
@@ -103,7 +104,8 @@ class InstanceLock:
                 fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
             except OSError as error:
                 raise name_taken("the lock file", path, error, otherwise=_OTHERWISE) from error
-            if os.fstat(fd).st_uid not in (os.geteuid(), 0):  # another owner could hold the lock without end
+            status = os.fstat(fd)  # another owner could hold the lock without end
+            if status.st_uid not in (os.geteuid(), 0) or not stat.S_ISREG(status.st_mode):
                 os.close(fd)
                 raise name_taken("the lock file", path, None, otherwise=_OTHERWISE)
             try:

@@ -17,7 +17,7 @@ from typing import Final, NoReturn
 from shmmap.formats.coordinate_system import CoordinateSystem
 from shmmap.formats.pcd.fields import FieldProblem, FieldTable, PcdField, parse_fields
 from shmmap.formats.source_file import refusal
-from shmmap.formats.stated_units import decoded, system_of_comments
+from shmmap.formats.stated_units import decoded, scale_notes, system_of_comments
 
 HEADER_LIMIT_BYTES: Final = 1 << 16  # a header must end within this
 MAX_POINTS: Final = (1 << 32) - 1  # WIDTH and HEIGHT are uint32 in PCL
@@ -179,7 +179,7 @@ class _HeaderParser:
             viewpoint=self._viewpoint(),
             version=b" ".join(self.values.get(b"VERSION", [])).decode("latin-1"),
             data_offset=data_offset,
-            warnings=tuple(self.warnings),
+            warnings=(*self.warnings, *scale_notes(self.comments)),
             crs=system_of_comments(self.comments),
         )
         _check_size(header, self.path, self.file_bytes)
@@ -209,6 +209,7 @@ class _HeaderParser:
             if key not in _KEYS:
                 if not self.values:
                     break
+                self.comments.append(decoded(b" ".join(words)))  # such as UNITS mm
                 unknown += 1
                 if unknown <= 3:
                     text = words[0][:40].decode("latin-1")

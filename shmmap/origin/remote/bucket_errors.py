@@ -9,7 +9,16 @@ from typing import Final
 from shmmap.errors import MapMissing, Offline, ShmmapError
 from shmmap.lazy_imports import FOR_REMOTE, needed_packages
 from shmmap.origin.remote.store import NoBucket, NoTag, StoreRefused
-from shmmap.origin.remote.transport import BETWEEN, is_panic, unasked_304
+from shmmap.origin.remote.transport import (
+    AGAIN,
+    BETWEEN,
+    CREDENTIALS,
+    NO_TLS,
+    PROXY,
+    is_panic,
+    status_hint,
+    unasked_304,
+)
 from shmmap.origin.remote.unread_answers import MAX_UNREAD_BYTES, UNREAD
 
 with needed_packages("a map in a bucket", together=FOR_REMOTE):
@@ -21,12 +30,11 @@ store's is an address at which the kernel refuses every connection."""
 _STATUS: Final = re.compile(r"\b([45]\d\d)\b (?:[A-Z][A-Za-z ]+)|status(?: code)?:? ([1-9]\d\d)")
 _MOVED: Final = re.compile(r"status code: 30[12378]\b")
 _UNASKED: Final = re.compile(r"status code: 304\b")
-_AGAIN: Final = "try again later"
 _SILENT: Final = "is the network up, and the address right? (s3:// has it of AWS_ENDPOINT_URL and AWS_REGION)"
 _REGION: Final = "is AWS_REGION that of the bucket?"
+_ACCOUNT: Final = "are the account's and the bucket's names right?"
 _CERTIFICATE: Final = "SSL_CERT_FILE names further authorities; is the clock right?"
 _ADDRESS: Final = "is the address that of a store, and is there such a bucket?"
-_CLOCK: Final = "are the credentials valid, and is the clock right?"
 _PANIC: Final = "this is a defect: please report it, with what the log says before"
 _TRUE_NAMES: Final = (
     (
@@ -40,6 +48,9 @@ _TRUE_NAMES: Final = (
         "is it a page, or compressed?",
     ),
     ("list response body", "its listing ended early", BETWEEN),
+    ("InvalidMessage(", "the answer is no TLS", NO_TLS),
+    ("ProxyAuthRequired", "the proxy wants a user and a password", PROXY),
+    ("TunnelUn", "the proxy does not connect to it", PROXY),
     ("Parse(", "the answer is no HTTP", "is the address right, and its port?"),
     ("source: Header {", "its answer has a header that cannot be read", BETWEEN),
     ("source: Metadata {", "its answer has a header that cannot be read", BETWEEN),
@@ -77,7 +88,7 @@ _REASONS: Final = {
 _HINTS: Final = {
     _ELSEWHERE: _REGION,
     "no permission": "may this account use this bucket? Its policy, or the account's roles, say so",
-    "the container is being deleted": _AGAIN,
+    "the container is being deleted": AGAIN,
 }
 """Hints for reasons that are none of the credentials."""
 _NO_BUCKET: Final = re.compile(
@@ -119,7 +130,7 @@ def failure(name: str, error: BaseException) -> Offline:
         why = _reason(text)
         return StoreRefused(
             f"{name}: refused, {why or 'no permission'}",
-            hint=_HINTS.get(why, _CLOCK),
+            hint=_HINTS.get(why, CREDENTIALS),
             of_credentials=True,
             status=403,
         )
@@ -132,12 +143,13 @@ def _out_of_reach(name: str, text: str) -> Offline:
         return NoBucket(f"{name}: there is no such bucket", status=404)
     found = _STATUS.search(text)
     status = int(found[1] or found[2]) if found is not None else 0
-    hint = _ADDRESS if status in (404, 405) else _CLOCK if 400 <= status < 500 else _AGAIN
+    hint = status_hint(status, _ADDRESS)
+    elsewhere = _REGION if name.startswith("s3:") else _ACCOUNT
     if why := _reason(text):
-        hint = _HINTS.get(why, hint)
+        hint = _HINTS.get(why, CREDENTIALS)
         return StoreRefused(f"{name}: refused, {why}", hint=hint, of_credentials=True, status=status)
     if NOWHERE in text or _MOVED.search(text):
-        return StoreRefused(f"{name}: refused, it is somewhere else", hint=_REGION)
+        return StoreRefused(f"{name}: refused, it is somewhere else", hint=elsewhere)
     if _UNASKED.search(text):
         return unasked_304(name)
     if _NO_TAG in text:
@@ -148,7 +160,7 @@ def _out_of_reach(name: str, text: str) -> Offline:
     if status:
         return StoreRefused(f"{name}: refused (status {status})", hint=hint, status=status)
     if "redirect" in text.lower():
-        return StoreRefused(f"{name}: refused, it is somewhere else", hint=_REGION)
+        return StoreRefused(f"{name}: refused, it is somewhere else", hint=elsewhere)
     if "certificate" in text.lower():
         return StoreRefused(f"{name}: the server's certificate is not accepted", hint=_CERTIFICATE)
     in_time = " in time" if "kind: Timeout" in text else ""

@@ -50,6 +50,7 @@ from shmmap.origin.remote.transport import (
     is_panic,
     refuse_page,
     refuse_plain_http,
+    status_hint,
     too_slow,
     unasked_304,
 )
@@ -326,10 +327,11 @@ class BucketStore:
         except (exceptions.NotFoundError, FileNotFoundError) as error:
             refuse_unread(name, error, ended)
             raise missing(name, error) from None
-        except (exceptions.AlreadyExistsError, exceptions.PreconditionError):
+        except (exceptions.AlreadyExistsError, exceptions.PreconditionError) as error:
             if conditional:
                 raise
-            raise StoreRefused(f"{name}: refused (status 412)", hint=BETWEEN) from None
+            status = 409 if isinstance(error, exceptions.AlreadyExistsError) else 412
+            raise StoreRefused(f"{name}: refused (status {status})", hint=status_hint(status, "")) from None
         except exceptions.NotModifiedError:
             if conditional:
                 raise
@@ -485,8 +487,15 @@ def _cannot_be_opened(where: StoreUrl) -> ConfigError:
 
 
 def _endpoint(scheme: str) -> str:
+    """Return the address of the store's server that the environment names; empty if it names none."""
     names = {"s3": ("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL", "AWS_ENDPOINT"), "az": ("AZURE_ENDPOINT",)}
-    return next((os.environ[name] for name in names.get(scheme, ()) if os.environ.get(name)), "")
+    name = next((name for name in names.get(scheme, ()) if os.environ.get(name)), "")
+    endpoint = os.environ.get(name, "").strip()
+    if name and not (endpoint.lower().startswith(("http://", "https://")) and host_of(endpoint)):
+        raise ConfigError(
+            f"{name} is no URL of a server", key=name, origin="environment", hint="such as https://HOST:PORT"
+        )
+    return endpoint
 
 
 def _no_redirects(where: StoreUrl) -> dict[str, Any]:

@@ -156,7 +156,7 @@ def credentials_source(scheme: str, environment: Mapping[str, str], *, instance:
         with contextlib.suppress(ValueError, TypeError):
             if datetime.fromisoformat(expiry.replace("Z", "+00:00")) <= datetime.now(timezone.utc):
                 raise ConfigError(
-                    f"they expired at {expiry}",
+                    f"the credentials in the environment expired at {expiry}",
                     key="AWS_CREDENTIAL_EXPIRATION",
                     origin="environment",
                     hint="export others, and start the daemon again",
@@ -295,6 +295,12 @@ def _azure_credentials(environment: Mapping[str, str], instance: bool) -> Creden
                 origin = files[0] if variable in in_file else "environment"
                 settings[setting] = _clean(found[variable], key=variable, origin=origin)
                 variables[setting] = variable
+    if in_file and not in_file.keys() & variables.values():
+        raise ConfigError(
+            f"{files[0]}: none of its names is known",
+            origin=files[0],
+            hint="such as AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY",
+        )
     if secrets := sorted(settings.keys() & _AZURE_SECRETS):
         variable = variables[secrets[0]]
         is_in_file = variable in in_file
@@ -320,23 +326,29 @@ def _given_file(environment: Mapping[str, str], name: str) -> list[str]:
 
 
 def _lines(path: str) -> dict[str, str]:
+    """Return the settings of a file of lines ``NAME=VALUE``, as a shell or the service manager reads them."""
     try:
-        with open(path, encoding="utf-8") as file:
+        with open(path, encoding="utf-8-sig") as file:
             lines = [line.strip() for line in file if line.strip() and not line.startswith("#")]
     except FileNotFoundError:
         return {}
     except (OSError, UnicodeDecodeError):
-        raise ConfigError("it cannot be read", origin=path) from None
+        raise ConfigError(f"{path} cannot be read", origin=path) from None
     if any("=" not in line for line in lines):
-        raise ConfigError("it is no list of lines NAME=VALUE", origin=path)
-    return {name.strip(): value.strip() for name, _, value in (line.partition("=") for line in lines)}
+        raise ConfigError(f"{path} is no list of lines NAME=VALUE", origin=path)
+    found = {}
+    for line in lines:
+        name, _, value = (part.strip() for part in line.removeprefix("export ").partition("="))
+        quoted = len(value) > 1 and value[0] == value[-1] and value[0] in "\"'"
+        found[name] = value[1:-1] if quoted else value
+    return found
 
 
 def _section(path: str, name: str) -> Mapping[str, str] | None:
     """Return a section of an INI file; None if the file or the section does not exist."""
     parser = configparser.RawConfigParser(default_section="", strict=False)
     try:
-        with open(path, encoding="utf-8") as file:
+        with open(path, encoding="utf-8-sig") as file:
             parser.read_file(file)
     except FileNotFoundError:
         return None

@@ -33,7 +33,13 @@ from shmmap.logfmt import log
 from shmmap.origin.remote.published_object import blob_path
 from shmmap.origin.remote.store import ObjectReader
 from shmmap.origin.remote.zstd_frame import DAMAGED
-from shmmap.private_directory import DIRECTORY_FLAGS, PRIVATE, NotPrivate, opened_private
+from shmmap.private_directory import (
+    DIRECTORY_FLAGS,
+    PRIVATE,
+    NotPrivate,
+    opened_private,
+    refuse_planted_above,
+)
 from shmmap.segment.writer import write_all
 
 _BLOB: Final = re.compile("blobs/sha256/([0-9a-f]{64})")
@@ -130,6 +136,7 @@ class ObjectTier:
         if nbytes > self._budget.limit_bytes:
             return False
         try:
+            refuse_planted_above(self.directory)
             os.makedirs(self._cache_dir, mode=0o755, exist_ok=True)
             if not self._budget.has_room(nbytes):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

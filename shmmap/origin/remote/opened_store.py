@@ -14,7 +14,7 @@ from shmmap.errors import MapDataError, MapMissing, Offline
 from shmmap.formats.durable_file import appearing_file, locked_file, writing_errors
 from shmmap.origin.remote.store import LONG_RUN, SERVING, WEB_SCHEMES, Listed, Store, Tag, Timeouts, read_url
 from shmmap.origin.remote.zstd_frame import DAMAGED
-from shmmap.private_directory import NotPrivate, open_followed, within
+from shmmap.private_directory import NotPrivate, open_followed, refuse_planted, within
 
 
 def open_store(
@@ -219,6 +219,7 @@ class DirectoryStore:
     @contextmanager
     def _folder(self, path: str, *, make: bool = False) -> Iterator[int]:
         """Open the folder of a file, whatever has its name afterwards; make what is missing of it."""
+        refuse_planted(self._root)
         fd = os.open(self._root, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:
             *parts, _ = filter(None, path.split("/"))

@@ -47,6 +47,12 @@ BYTES_PER_S: Final = 64 << 10
 """Rate below which an answer is given up."""
 _PANICS: Final = ("PanicException", "RustPanic")
 BETWEEN: Final = "does a proxy between here and the store change its answers?"
+AGAIN: Final = "try again later"
+CREDENTIALS: Final = "are the credentials valid, and is the clock right?"
+NO_TLS: Final = "is the port right? For plain http, the address begins with http://"
+PROXY: Final = (
+    "http_proxy and https_proxy name the proxy, with its user and password, and no_proxy exceptions"
+)
 _LOOK_S: Final = 0.1
 _PAGE_BYTES: Final = 64 << 10
 _PORTAL: Final = "is this the login page of a network, or another server than the map's?"
@@ -151,6 +157,10 @@ class Body:
         """Return all bytes; raise if some are missing, or if they are a page."""
         if self.lacks:
             raise self.cut()
+        if self.size is not None and self.at > self.size:
+            raise StoreRefused(
+                f"{self._name}: it has sent more than the {self.size:,} bytes announced", hint=_CUT
+            )
         if bytes(self._data[:64]).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<"):
             raise _page(self._name, self._media_type)
         if self.at > self._max_bytes or (self._exact and self.at != self._max_bytes):
@@ -172,6 +182,20 @@ def refuse_page(name: str, media_type: str) -> None:
 def _page(name: str, media_type: str) -> Offline:
     kind = media_type.partition(";")[0].strip().lower() or "of no stated type"
     return StoreRefused(f"{name}: what the store answers is no map: a page ({kind})", hint=_PORTAL)
+
+
+_HINTS: Final = {
+    **dict.fromkeys((400, 401, 403), CREDENTIALS),
+    407: PROXY,
+    **dict.fromkeys((408, 409, 425, 429), AGAIN),
+    **dict.fromkeys((412, 413, 416, 431), BETWEEN),
+    511: _PORTAL,
+}
+
+
+def status_hint(status: int, otherwise: str) -> str:
+    """Return the hint for an answer of this status; for most below 500 it is ``otherwise``."""
+    return _HINTS.get(status, AGAIN if status >= 500 else otherwise)
 
 
 def unasked_304(name: str) -> Offline:

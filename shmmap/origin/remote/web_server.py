@@ -11,6 +11,7 @@ import base64
 import http.client
 import io
 import random
+import re
 import socket
 import ssl
 import threading
@@ -25,22 +26,28 @@ from typing import Any, Final, NoReturn, TypeAlias, TypeVar
 from shmmap.errors import BadRequest, ConfigError, MapMissing, Offline
 from shmmap.origin.remote.store import Listed, StoreRefused, StoreUrl, Tag, Timeouts
 from shmmap.origin.remote.transport import (
+    AGAIN,
     BETWEEN,
+    NO_TLS,
+    PROXY,
     Body,
     answer_limit_s,
     call_apart,
     refuse_page,
     refuse_plain_http,
+    status_hint,
     too_slow,
     unasked_304,
 )
 
 _READ_ONLY: Final = "a web server cannot be written to: publish to its directory, or to the bucket behind it"
 _SILENT: Final = "is the network up, and the address right?"
-_AGAIN: Final = "try again later"
-_CLOCK: Final = "are the credentials valid, and is the clock right?"
+_PUBLIC: Final = "a web server is asked without credentials: may everybody read there?"
+_ADDRESS: Final = "is the address right?"
 _ELSEWHERE: Final = "only redirects to the same server are followed: name the place itself in the URL"
 _CERTIFICATE: Final = "SSL_CERT_FILE names further authorities; is the clock right?"
+_TUNNEL: Final = re.compile(r"Tunnel connection failed: ([0-9]+)")  # of `http.client`
+_IN_TARGETS: Final = "%/:=&?~#+!$,;'@()*[]"
 _PIECE_BYTES: Final = 64 << 10
 _MAX_REDIRECTS: Final = 5
 _IDLE_CONNECTIONS: Final = 32
@@ -368,7 +375,14 @@ class WebServer:
             raise StoreRefused(
                 f"{name}: the server's certificate is not accepted", hint=_CERTIFICATE
             ) from None
-        except OSError:
+        except ssl.SSLError as error:
+            if isinstance(error, ssl.SSLEOFError):
+                raise _Failed(Offline(f"{name}: no answer", hint=_SILENT)) from None
+            raise StoreRefused(f"{name}: the answer is no TLS", hint=NO_TLS) from None
+        except OSError as error:
+            if refused := _TUNNEL.match(str(error)):
+                wants = "wants a user and a password" if refused[1] == "407" else "does not connect to it"
+                raise StoreRefused(f"{name}: the proxy {wants} (status {refused[1]})", hint=PROXY) from None
             raise _Failed(Offline(f"{name}: no answer", hint=_SILENT)) from None
         except (http.client.HTTPException, ValueError):
             raise _Failed(Offline(f"{name}: the answer is no HTTP", hint=_SILENT)) from None
@@ -388,17 +402,15 @@ class WebServer:
         if status in _GONE:
             raise MapMissing(f"{name} is not there")
         if status in _NO_PERMISSION:
-            raise StoreRefused(f"{name}: refused, no permission", hint=_CLOCK, of_credentials=True)
+            raise StoreRefused(f"{name}: refused, no permission", hint=_PUBLIC, of_credentials=True)
         if status in _MOVED:
             origin = self._server.origin
             there = urllib.parse.urljoin(f"{origin}{target}", where)
             if not where or _origin_of(there) != origin:
                 raise StoreRefused(f"{name}: refused, it is somewhere else", hint=_ELSEWHERE)
-            parts = urllib.parse.urlsplit(there)
+            parts = urllib.parse.urlsplit(urllib.parse.quote(there.encode("latin-1"), safe=_IN_TARGETS))
             raise _Moved(urllib.parse.urlunsplit(("", "", parts.path or "/", parts.query, "")))
-        refused = StoreRefused(
-            f"{name}: refused (status {status})", hint=_CLOCK if 400 <= status < 500 else _AGAIN
-        )
+        refused = StoreRefused(f"{name}: refused (status {status})", hint=status_hint(status, _ADDRESS))
         if status in _TRANSIENT:
             raise _Failed(refused)
         raise refused
@@ -434,8 +446,12 @@ class _Reading:
             )
         elif (
             response.getheader("Content-Range", "").split("/")[0] != f"bytes {body.at}-{(body.size or 0) - 1}"
+            or response.getheader("Content-Encoding", "identity").lower() != "identity"
         ):
             raise StoreRefused(f"{name}: its answer is another part than the one asked for", hint=BETWEEN)
+        elif response.getheader("ETag", self._tag) != self._tag:
+            self._body = None
+            raise _Failed(StoreRefused(f"{name}: it was changed while it was read", hint=AGAIN))
         clock.allow(self._max_bytes if body.size is None else body.size - body.at)
         try:
             while piece := response.read1(_PIECE_BYTES):

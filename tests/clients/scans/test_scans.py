@@ -171,6 +171,8 @@ def test_places_of_a_route(tmp_path: Path, name: str, text: str) -> None:
         ("1,2\n3\n", "line 2: not `x,y`"),
         ("x,y\n1,2\n\n3,nan\n", "line 4: not `x,y`"),
         ("east,north\n1,2\n", "line 1: not `x,y`"),
+        ("x,lat\n1,2\n", "line 1: not `x,y`"),
+        ("1e308,1e308\n", "line 1: not `x,y`"),
         ("1 2\n", "line 1: not `x,y`"),
     ],
 )

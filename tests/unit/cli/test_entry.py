@@ -110,6 +110,18 @@ def test_a_full_disk_is_no_defect(words: str) -> None:
     assert done.stderr.startswith("shmmap: cannot write the output: No space left on device\nhint: ")
 
 
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [("inspect /nowhere", 66), ("nonsense", 2), ("version", 0), ("merge {0}/a.xyz {0}/b.pcd", 0)],
+)
+def test_a_full_disk_under_stderr_ends_nothing(tmp_path: Path, words: str, code: int) -> None:
+    """Neither the exit code of an error is lost, nor work whose progress cannot be written."""
+    (tmp_path / "a.xyz").write_text("1 2 3\n")
+    with open("/dev/full", "w", encoding="utf-8") as full:
+        command = [sys.executable, "-m", "shmmap.cli", *words.format(tmp_path).split()]
+        assert subprocess.run(command, stdout=subprocess.DEVNULL, stderr=full, check=False).returncode == code
+
+
 def test_closed_streams_are_no_defect() -> None:
     command = f"{sys.executable} -m shmmap.cli"
     done = subprocess.run(

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import resource
 from pathlib import Path
@@ -17,6 +18,7 @@ from shmmap.dividing.settings import DivideSettings
 from shmmap.errors import BadRequest, CannotWrite, MapDataError, MapMissing
 from shmmap.formats import cloud
 from shmmap.formats.pcd.writer import write_pcd
+from shmmap.origin.map_report import REPORT_NAME
 from tests.support.clouds import Columns, rows_of, xyzircaedt
 from tests.support.divided_map import read_pcd
 
@@ -57,6 +59,11 @@ def test_a_moved_map_goes_back(tmp_path: Path) -> None:
         assert found[axis].dtype == np.float64
         assert np.abs(found[axis][order] - columns[axis]).max() <= 0.0005
     merge([map_dir], tmp_path / "kept.pcd", keep_frame=True)
+    report = json.loads((map_dir / REPORT_NAME).read_text())
+    for bad in ([1e308, 0.0, 0.0], [float("nan")] * 3, "there"):
+        (map_dir / REPORT_NAME).write_text(json.dumps({**report, "origin": bad}))
+        with pytest.raises(MapDataError, match=f"origin in its {REPORT_NAME} is none"):
+            merge([map_dir], tmp_path / "bad.pcd")
     assert read_pcd(tmp_path / "kept.pcd")["x"].dtype == np.float32
 
 

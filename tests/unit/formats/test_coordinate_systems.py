@@ -73,6 +73,8 @@ VERTCRS = 'VERTCRS["H",VDATUM["N"],CS[vertical,1],AXIS["gravity-related height (
         ('PROJCS("round",UNIT("foot",0.3048))', FT, FT, 0),
         (UTM.replace('UNIT["metre",1]', 'UNIT["kilometre",1000]'), 1000.0, 1000.0, 32632),
         ('GEOCCS["ecef",DATUM["D"],UNIT["metre",1]]', 1.0, 1.0, 0),
+        (f'COMPD_CS["c",{UTM},VERT_CS["d",UNIT["metre",1],AXIS["Depth",DOWN]]]', 1.0, 0.0, 32632),
+        ('ENGCRS["s",AXIS["x",east,UNIT["metre",1]],AXIS["y",north,UNIT["foot",0.3048]]]', 0.0, 0.0, 0),
     ],
 )  # fmt: skip
 def test_units_in_wkt(text: str, plane: float, height: float, epsg: int) -> None:

@@ -84,6 +84,11 @@ def test_only_the_legacy_field(tmp_path: Path, suffix: str) -> None:
         (lambda path: patched(path, 131, "d", 0.0), "bad_las", "the scale of x is 0"),
         (lambda path: patched(path, 147, "d", float("nan")), "bad_las", "the scale of z is nan"),
         (lambda path: patched(path, 163, "d", float("inf")), "bad_las", "the offset of y is inf"),
+        (lambda path: patched(path, 139, "d", 1e-300), "bad_las", "the scale of y is 1e-300"),
+        (lambda path: patched(path, 131, "d", 1e308), "bad_las", "the scale of x is 1e+308"),
+        (lambda path: patched(path, 171, "d", -1e308), "bad_las", "the offset of z is -1e+308"),
+        (lambda path: patched(path, 25, "B", 5), "bad_las", "LAS 1.5; 1.0 to 1.4 are read"),
+        (lambda path: patched(path, 104, "B", 0x80 | 11), "bad_las", "point format 11; 0 to 10 are read"),
         (lambda path: patched(path, 247, "Q", 10**9), "truncated", "1000000000 points announced"),
         (lambda path: patched(path, 247, "Q", 10**18), "truncated", "points announced"),
         (lambda path: path, "", ""),
@@ -279,6 +284,7 @@ def test_extra_bytes_that_the_points_do_not_have(
     ("place", "value", "note", "column"),
     [
         (2, b"\x00\x00", "", "bar"),  # no bytes: it describes nothing
+        (3, b"\x08", "'foo' has scale 0, which is ignored", "foo"),
         (2, b"\x63\x00", "does not fit", ""),  # a type that is not defined
         (4, b"\xff\xfe\0", "no name of its own", "__"),
         (4, b"X\0", "no name of its own", "X_2"),
@@ -306,7 +312,7 @@ def test_extra_bytes_described_badly(
     assert np.array_equal(found.xyz[:, 0], np.arange(10.0))
     assert note in " ".join(found.warnings)
     assert not column or column in found.columns
-    if place == 4:
+    if place in (3, 4):
         assert np.array_equal(found.columns[column], np.arange(10) + 0.5)
     for name in ("withheld", "classification", "gps_time"):
         assert not found.columns[name].any()

@@ -270,6 +270,20 @@ def test_rows_of_zeros_are_named(tmp_path: Path) -> None:
     assert "2 points are at exactly (0, 0, 0)" in " ".join(read_cloud(path).warnings)
 
 
+def test_heights_that_stand_for_none_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("x,y,z\n1,2,3\n4,5,-9999\n6,7,-32768.0\n8,9,-9998\n")
+    assert "2 points have a z of -9999 or" in " ".join(read_cloud(path).warnings)
+
+
+@pytest.mark.parametrize("columns", [3, 6])
+def test_a_colour_of_shares_in_front_is_named(tmp_path: Path, columns: int) -> None:
+    path, shares = tmp_path / "a.txt", [[value / 255 for value in values] for values in RGB]
+    path.write_text(rows(*shares, *[XYZ, RGB][columns > 3]))
+    said = " ".join(read_cloud(path).warnings)
+    assert ("columns 1 to 3 lie within 0 and 1" in said) == (columns == 3)  # a cloud with a colour may
+
+
 @pytest.mark.parametrize(
     ("first", "odd"),
     [

@@ -55,6 +55,7 @@ def header_of(names: str) -> tuple[tuple[int, int, int], tuple[float, float]] | 
         ("X(East) [mm],Y(North) [mm],Z(Up) [mm]", 0.001, 0.001),
         ("x [mm]:float,y [mm]:float,z [mm]:float", 0.001, 0.001),
         ("x (unit: mm),y [units=mm],z (all in mm)", 0.001, 0.001),
+        ("x [0.001 m],y [0.001 m],z [1e-3 m]", 0.001, 0.001),
         ("x [m],y [m],z [m]", 1.0, 1.0),
         ("x [m],y,z", 1.0, 1.0),
         ("x [mm],y [mm],z", 0.001, 0.0),  # z may be in either: not decided
@@ -134,7 +135,24 @@ def test_names_of_coordinates(names: str, places: tuple[int, int, int] | None) -
         ("saved in 2 m", None, None),
         ("angle units: deg", None, None),
         ("time unit: m", None, None),
-        ("units per metre: 1000", None, None),
+        ("units per metre: 1000", 0.001, 0.001),
+        ("metersPerUnit = 0.01", 0.01, 0.01),
+        ("all values in units of 0.01 m", 0.01, 0.01),
+        ("Position units: feet (US survey)", US_FT, US_FT),
+        ("coordinates as mm", 0.001, 0.001),
+        ("units -> mm", 0.001, 0.001),
+        ("<LinearUnit>Foot_US</LinearUnit>", US_FT, US_FT),
+        ("Einheit: mm", 0.001, 0.001),
+        ("Vertical datum: NAVD88 (ft)", None, FT),
+        ("vertical datum NAVD88, US survey feet", None, FT),  # the last word counts
+        ("CRS: EPSG:2277 (ftUS)", US_FT, US_FT),
+        ("EPSG:32632", None, None),
+        ("EPSG:4326", 0.0, 1.0),
+        ('crs PROJCS["x",UNIT["US survey foot",0.3048006096012192]]', US_FT, US_FT),
+        ("+proj=lcc +units=us-ft +vunits=m +no_defs", US_FT, 1.0),
+        ("+proj=tmerc +to_meter=0.3048", FT, FT),
+        ("+proj=longlat +datum=WGS84", 0.0, 1.0),
+        ("+proj=utm +zone=32", None, None),
         ("1000 points in 3 scans", None, None),
         ("points in 12 m tiles", None, None),
         ("voxel size 5 mm", None, None),
@@ -182,6 +200,7 @@ PLY = (
         ("a.ply", "ply\nobj_info unit = millimetres\n" + PLY + ROWS),
         ("a.pcd", "# .PCD v0.7 - Point Cloud Data file format\n# unit: mm\n" + PCD + ROWS),
         ("a.pcd", "# coordinates in mm\n" + PCD + ROWS),
+        ("a.pcd", PCD.replace("WIDTH", "UNITS mm\nWIDTH") + ROWS),
     ],
 )
 def test_stated_units_are_refused_with_the_factor_and_converted(tmp_path: Path, name: str, text: str) -> None:
@@ -298,3 +317,19 @@ def test_a_unit_that_differs_from_the_stated_one_is_noted(
     assert note in converted
     assert ("although" in converted) == ("although" in note)
     assert any("a.csv: --drop-noise had no effect" in one for one in notes)
+
+
+@pytest.mark.parametrize(
+    ("comment", "scale"),
+    [("scale: 0.001", "0.001"), ("Scale factor = 1000", "1000"), ("coordinates multiplied by 100", "100"),
+     ("scale 1.0", ""), ("grayscale 255", ""), ("made at a scale", "")],
+)  # fmt: skip
+def test_a_scale_that_a_comment_states_is_named(tmp_path: Path, comment: str, scale: str) -> None:
+    for name, text in (
+        ("a.xyz", f"# {comment}\n" + ROWS),
+        ("a.ply", f"ply\ncomment {comment}\n" + PLY + ROWS),
+        ("a.pcd", f"# {comment}\n" + PCD + ROWS),
+    ):
+        (tmp_path / name).write_text(text)
+        said = [note for note in read_cloud(tmp_path / name).warnings if "scale" in note]
+        assert said == ([f"a comment states a scale of {scale}, which is not applied"] if scale else [])

@@ -410,3 +410,20 @@ def test_a_whole_map_that_is_served_beside_cells_is_reported(tmp_path: Path) -> 
     assert f"seems to be {tmp_path / 'pointcloud_map'}: name that" in problem
     assert open_map(tmp_path / "pointcloud_map.pcd").load().problems == ()
     assert len(open_map(tmp_path / "pointcloud_map").load()) == len(NAMES)
+
+
+def test_two_lists_of_cells_that_differ_are_reported(tmp_path: Path) -> None:
+    name = "pointcloud_map_metadata.yaml"
+    beside, among = autoware_map(tmp_path) / name, tmp_path / "pointcloud_map.pcd" / name
+    among.write_text(beside.read_text())
+    assert not open_map(tmp_path).load().problems
+    among.write_text(beside.read_text() + "# of another day\n")
+    assert f"{beside} is read, not {among}" in " ".join(open_map(tmp_path).load().problems)
+    assert not open_map(tmp_path, metadata=among).load().problems
+
+
+def test_the_only_file_whose_name_is_no_utf_8_is_named(tmp_path: Path) -> None:
+    (tmp_path / "cells").mkdir()
+    (tmp_path / os.fsdecode(b"cells/\xe4.pcd")).write_bytes(b"")
+    with pytest.raises(MapMissing, match="the name is not UTF-8"):
+        open_map(tmp_path / "cells").load()

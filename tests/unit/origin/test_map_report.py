@@ -56,6 +56,8 @@ def test_also_where_the_catalogue_comes_from_the_cache(
         (json.dumps({**REPORT_HEAD, "version": 99, "origin": [1, 2, 3]}), UNKNOWN_FRAME),
         (json.dumps({**REPORT_HEAD, "origin": [1, 2]}), UNKNOWN_FRAME),
         (json.dumps({**REPORT_HEAD, "origin": [1, 2, float("nan")]}), UNKNOWN_FRAME),
+        (json.dumps({**REPORT_HEAD, "origin": [1e308, 0, 0]}), UNKNOWN_FRAME),
+        (json.dumps({**REPORT_HEAD, "unit_m": [1, float("nan")]}), UNKNOWN_FRAME),
         (json.dumps({**REPORT_HEAD, "origin": [1, 2, 3], "unit_m": [0, 1]}), UNKNOWN_FRAME),
         (json.dumps({**REPORT_HEAD, "origin": [1, 2, 3]}), MapFrame((1.0, 2.0, 3.0))),
         # as earlier versions wrote it

@@ -289,12 +289,16 @@ def _crs_lines(crs: CoordinateSystem | None) -> list[tuple[str, str]]:
     return [*([("crs", crs.label)] if crs.label else []), ("units", said + unsaid)]
 
 
+def _coordinate(value: float) -> str:
+    return f"{value:.3f}" if abs(value) < 1e15 else f"{value:g}"
+
+
 def _bounds_lines(bounds: outputs.Bounds | None, metric: bool = True) -> list[tuple[str, str]]:
     if bounds is None:
         return [("bounds", "none: no finite point")]
     unit = " m" if metric else ""
     return [
-        (axis, f"{low:.3f} .. {high:.3f}{unit} ({high - low:.3f}{unit})")
+        (axis, f"{_coordinate(low)} .. {_coordinate(high)}{unit} ({_coordinate(high - low)}{unit})")
         for axis, low, high in zip("xyz", bounds.min, bounds.max, strict=True)
     ]
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shmmap.cli.options import Subparsers, add_json_option, add_verb
+from shmmap.cli.program import write_bytes, write_text
 from shmmap.cli.screens.output import print_json, print_line
 from shmmap.errors import CannotWrite
 
@@ -91,10 +92,10 @@ def run(args: argparse.Namespace) -> int:
     with signals_interrupt(), progress_for(quiet=args.json) as progress:
         report = _drive(args, progress)
     duration_s = time.monotonic() - started_s
-    picture.write_text(report.picture_svg, encoding="utf-8")
+    write_text(picture, report.picture_svg)
     points = picture.with_suffix(".png")
     if report.picture_png and points != picture:
-        points.write_bytes(report.picture_png)
+        write_bytes(points, report.picture_png)
     if args.json:
         pictures = {"svg": str(picture), **({"png": str(points)} if report.picture_png else {})}
         print_json({**report.document, **pictures, "seconds": round(duration_s, 3)})

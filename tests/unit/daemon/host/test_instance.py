@@ -77,6 +77,13 @@ def test_refused_for_another_reason(tmp_path: Path, left: str) -> None:
     assert (path.read_text() if path.exists() else "") == left
 
 
+def test_a_lock_that_is_no_file(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "a.lock")
+    with pytest.raises(CannotStart, match="the lock file cannot be"):
+        InstanceLock(str(tmp_path / "a.lock"))
+    assert (tmp_path / "a.lock").is_fifo()
+
+
 def test_a_lock_file_that_a_cleaner_removed(tmp_path: Path) -> None:
     """It is made again, and hinders a second daemon as before."""
     path = tmp_path / "a.lock"

@@ -174,6 +174,23 @@ def test_google_and_azure(home: Path) -> None:
     assert SECRET not in str(error.value)
 
 
+@pytest.mark.parametrize("line", ["\ufeff{}={}", "export {}={}", '{} = "{}"', "{}='{}'\r"])
+def test_files_as_editors_and_shells_write_them(home: Path, line: str) -> None:
+    lines = (line.format("AZURE_STORAGE_ACCOUNT_NAME", "a"), line.format("AZURE_STORAGE_SAS_TOKEN", SECRET))
+    (home / "shmmap.azure").write_text("\n".join((lines[0], lines[1].lstrip("\ufeff"))))
+    given = {"CREDENTIALS_DIRECTORY": str(home)}
+    assert azure(given) == {"account_name": "a", "sas_key": SECRET}
+    profile(home / ".aws/credentials")
+    text = (home / ".aws/credentials").read_text()
+    (home / ".aws/credentials").write_text(f"\ufeff{text}", encoding="utf-8", newline="\r\n")
+    assert keys({}) == ("k", None)
+
+
+def test_a_file_of_unknown_names_is_not_taken_for_no_credentials(home: Path) -> None:
+    (home / "shmmap.azure").write_text(f"AZURE_STORAGE_KEY={SECRET}\n")
+    refused(lambda: azure({"CREDENTIALS_DIRECTORY": str(home)}), "none of its names is known", "")
+
+
 def test_sources_are_named_and_nothing_else(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def source(scheme: str, **environment: str) -> str:
         return credentials_source(scheme, environment)

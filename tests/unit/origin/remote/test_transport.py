@@ -276,6 +276,74 @@ def test_a_body_that_was_cut_is_gone_on_with(web: FaultyWeb) -> None:
     assert [status for _, status in web.requests()] == [200, 206]
 
 
+def test_parts_of_two_states_are_not_joined(web: FaultyWeb, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The object is replaced between the two requests, and the server does not look at ``If-Range``."""
+    states, faults = iter([TEXT]), iter(["truncate"])
+    web.read = lambda _path: next(states, TEXT.replace(b"ab", b"cd"))
+    web.fault = lambda _path: next(faults, "")
+    assert bytes(opened(web, "http", AGAIN).get("CURRENT", 99)) == TEXT.replace(b"ab", b"cd")
+    head = b"HTTP/1.1 206 Partial Content\r\nConnection: close\r\nContent-Range: bytes 20-40/41\r\n"
+    for more, says in (
+        (b"Content-Length: 50\r\n\r\n" + bytes(50), "sent more than the 41 bytes announced"),
+        (b"Content-Length: 21\r\nContent-Encoding: gzip\r\n\r\n" + bytes(21), "is another part than"),
+    ):
+        monkeypatch.setitem(WRONG_ANSWERS, "other part", partial(_only, head + more))
+        faults, states = iter(["truncate", "other part"]), iter([TEXT, TEXT])
+        assert says in outcome(partial(opened(web, "http", AGAIN).get, "CURRENT", 99))
+
+
+def test_redirects_to_names_that_are_not_escaped(web: FaultyWeb, monkeypatch: pytest.MonkeyPatch) -> None:
+    moved = "HTTP/1.1 302 Found\r\nLocation: /new/\u00e4 b\r\nContent-Length: 0\r\n\r\n".encode()
+    monkeypatch.setitem(WRONG_ANSWERS, "moved", partial(_only, moved))
+    web.fault = lambda path: "" if path.startswith("new/") else "moved"
+    assert bytes(opened(web, "http").get("CURRENT", 99)) == TEXT
+    assert web.requests()[-1] == ("new/%C3%A4%20b", 200)
+
+
+@pytest.mark.parametrize("scheme", ["http", "s3"])
+def test_hints_fit_the_status(web: FaultyWeb, scheme: str) -> None:
+    web.fault = lambda _path: status
+    for status, hint in {
+        "429": "try again later", "408": "try again later", "507": "try again later", "405": "address",
+        "451": "address", "414": "address", "407": "name the proxy", "400": "credentials",
+        "511": "login page",
+    }.items():  # fmt: skip
+        with pytest.raises(StoreRefused, match=f"status {status}") as refused:
+            opened(web, scheme).get("CURRENT", 99)
+        assert hint in refused.value.hint
+    status = "403"
+    with pytest.raises(StoreRefused, match="no permission") as refused:
+        opened(web, scheme).get("CURRENT", 99)
+    assert ("without credentials" in refused.value.hint) == (scheme == "http")
+
+
+@pytest.mark.parametrize("url", ["https://maps.example.org/m", "s3://maps/m"])
+def test_a_proxy_that_does_not_connect_is_no_silence(
+    other: FaultyWeb, monkeypatch: pytest.MonkeyPatch, url: str
+) -> None:
+    monkeypatch.setenv("https_proxy", other.url)
+    monkeypatch.setenv("AWS_ENDPOINT_URL", "https://store.example.org")
+    assert "the proxy does not connect to it" in outcome(partial(open_store(url, timeouts=ONCE).get, "m", 99))
+
+
+@pytest.mark.parametrize("scheme", ["http", "s3"])
+def test_plain_http_at_the_other_end_is_no_silence(
+    web: FaultyWeb, monkeypatch: pytest.MonkeyPatch, scheme: str
+) -> None:
+    web.fault = lambda _path: "no HTTP"
+    tls = web.url.replace("http://", "https://")
+    monkeypatch.setenv("AWS_ENDPOINT_URL", tls)
+    store = open_store("s3://maps/m" if scheme == "s3" else f"{tls}/m", timeouts=ONCE)
+    assert "the answer is no TLS" in outcome(partial(store.get, "CURRENT", 99))
+
+
+@pytest.mark.parametrize("endpoint", ["127.0.0.1:9000", "https://", "http://[bad", "ftp://host"])
+def test_an_address_that_is_no_url_is_refused(monkeypatch: pytest.MonkeyPatch, endpoint: str) -> None:
+    monkeypatch.setenv("AWS_ENDPOINT_URL", endpoint)
+    with pytest.raises(ConfigError, match="AWS_ENDPOINT_URL is no URL of a server"):
+        open_store("s3://maps/m")
+
+
 def test_an_idle_connection_that_was_closed_is_no_failure(web: FaultyWeb) -> None:
     store = opened(web, "http")
     assert bytes(store.get("m", 99)) == TEXT
