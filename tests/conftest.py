@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import gc
 import os
 import shutil
 import signal
+import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
 import hypothesis
@@ -70,9 +73,24 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
                 item.add_marker(pytest.mark.skip(reason=NEEDS_ROOT))
 
 
-def pytest_collection() -> None:
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
     """Spare the garbage collector what stays to the end: modules and tests by the thousand."""
     gc.disable()
+    with _compiled_once():
+        return (yield)
+
+
+@contextlib.contextmanager
+def _compiled_once() -> Iterator[None]:
+    """Have one process import the tests, and the others wait until their modules are compiled on disk."""
+    with open(__file__, encoding="utf-8") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if not sys.dont_write_bytecode:
+                fcntl.flock(file, fcntl.LOCK_SH)
+        yield
 
 
 def pytest_collection_finish() -> None:

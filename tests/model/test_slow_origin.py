@@ -38,6 +38,7 @@ def test_an_outage_that_is_longer_than_that_is_not() -> None:
     assert driven("route", Outages(40.0, 120.0, 120.0)).late > 50
 
 
+@pytest.mark.slow
 def test_without_a_route_few_wait() -> None:
     """Of a short drive with slow loads at the wrong moment more wait than of many drives."""
     drives = [driven("no route", OUTAGES["none"], seed) for seed in range(8)]

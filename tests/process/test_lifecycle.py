@@ -128,7 +128,7 @@ def test_two_instances_side_by_side(
 def test_no_map(daemon: DaemonFactory, tmp_path: Path, make: Callable[[Path], None], code: int) -> None:
     path = tmp_path / "map.pcd"
     make(path)
-    one: DaemonProcess = daemon(path, start=False, forked=False)
+    one: DaemonProcess = daemon(path, start=False)
     assert one.run_to_end() == code
     assert str(path) in one.log
     assert one.leftovers() == []
@@ -217,7 +217,7 @@ def _open_paths(pid: int) -> list[str]:
 def test_a_stale_socket_is_no_hindrance(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
 ) -> None:
-    one: DaemonProcess = daemon(divided_map.root, start=False, forked=False)
+    one: DaemonProcess = daemon(divided_map.root, start=False)
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as left:
         left.bind(one.endpoint)
     one.start()
@@ -228,7 +228,7 @@ def test_foreign_segments_are_left_alone(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
 ) -> None:
     """Leftovers of this instance go, damaged ones included; other files stay."""
-    one: DaemonProcess = daemon(divided_map.root, start=False, forked=False)
+    one: DaemonProcess = daemon(divided_map.root, start=False)
     other = Path(one.shm_dir, "shmmap.other.0011223344556677")
     longer = Path(one.shm_dir, f"shmmap.{one.instance}x.0011223344556677")
     for path in (other, longer):

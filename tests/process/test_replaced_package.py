@@ -126,7 +126,7 @@ def reached(ended: str) -> str:
     return re.sub(rf"shmmap\.errors\.({'|'.join(SILENT)})\b", "shmmap.errors.DaemonUnreachable", ended)
 
 
-@pytest.mark.parametrize("has", ["client", "all"])
+@pytest.mark.parametrize("has", ["client", pytest.param("all", marks=pytest.mark.slow)])
 def test_a_program_goes_on(served: DaemonProcess, divided_map: DividedMap, tmp_path: Path, has: str) -> None:
     """Whatever was made before goes on as without an upgrade, and a name not used before says what to do."""
     expected, _ = walked(served, divided_map, tmp_path, has, nothing)

@@ -218,6 +218,7 @@ def test_hostile_names(standing: DaemonProcess) -> None:
         assert [sorted(one) for one in options] == [["<b>x</b>", "no client", "twice"]]
 
 
+@pytest.mark.slow
 def test_a_killed_daemon_and_a_changed_cell(daemon: DaemonFactory, divided_map: DividedMap) -> None:
     one = daemon(divided_map.root)
     with View(one, "--circle", "0,0,30") as view, Viewer(view.url) as page:

@@ -2,15 +2,17 @@
 """Runs ``shmmap``, its programs and daemons in forks of a process that has imported them, which is quicker.
 
 Whatever a process does after its imports is done: arguments, environment, directory, exit code, a crash at a
-step, other modules on the path.  Command lines of the pages, programs other than the daemon that are sent
-signals, and what depends on the interpreter's start (another ``shmmap`` on the path, ``LD_PRELOAD``, the
-locale) are processes of their own elsewhere.
+step, other modules on the path, what is registered for its end.  Command lines of the pages, programs other
+than the daemon that are sent signals, and what depends on the interpreter's start (another ``shmmap`` on the
+path, ``LD_PRELOAD``, the locale) are processes of their own elsewhere.  So is what a program starts in turn,
+except for what `_starts_children` knows: a daemon's live worker, and others, are forks, too.
 
 As a program: ``python -m tests.support.forked_programs FD`` serves requests on a socket until its end.
 """
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import ctypes
 import gc
@@ -20,23 +22,37 @@ import json
 import os
 import pkgutil
 import runpy
+import signal
 import socket
 import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import IO, Any, Final, NoReturn
 
+from shmmap.installed import refuse_if_replaced
+from shmmap.processes.end_with_parent import die_with
+from shmmap.processes.start_child import channel
 from tests.support.kernels_once import watch
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 
+_STARTERS: Final = (
+    "shmmap.daemon.live_relay",
+    "shmmap.dividing.served_cloud",
+    "shmmap.origin.remote.verify_apart",
+    "shmmap.prepare.task_pool",
+)
+"""Modules that start children of a program, other than loaders."""
 _AT_START: Final = ("PYTHON", "LD_", "LC_", "LANG", "NUMBA_")
 _PACKAGES: Final = (
     "shmmap.cli.verbs",
     "shmmap.live_worker",
+    "shmmap.prepare",
     "shmmap.publishing",
     "shmmap.origin.remote",
     "shmmap_clients.compare_map_filter",
@@ -51,6 +67,7 @@ _MODULES: Final = (
     "shmmap.daemon.loading.worker_main",
     "shmmap.daemon.main",
     "shmmap.daemon.map.published_origin",
+    "shmmap.dividing.child_main",
     "cryptography.hazmat.primitives.serialization",
     "numba",
     "obstore",
@@ -63,6 +80,7 @@ _ROOM: Final = 1 << 14
 """Bytes of a command line, and of an environment, more than the fork server has itself."""
 _PR_SET_CHILD_SUBREAPER: Final = 36
 _prctl: Final = ctypes.CDLL(None).prctl
+_ADOPTED_S: Final = 60.0
 _REQUEST_BYTES: Final = 1 << 18
 _FDS: Final = 2
 
@@ -105,11 +123,9 @@ def fork_program(
     request = _request(module, words, environment, "/", adopted=True)
     fd = output.fileno()
     try:
-        # an orphan becomes this process's child, and so does the fork, when the process that forked it ends
-        _prctl(_PR_SET_CHILD_SUBREAPER, 1)
-        pid = server.ask(request, [fd, fd])
+        with _adopting():  # also the fork, when the process that forked it ends
+            pid = server.ask(request, [fd, fd])
     finally:
-        _prctl(_PR_SET_CHILD_SUBREAPER, 0)
         server.lock.release()
     return _Adopted(pid, [sys.executable, "-m", module, *words])
 
@@ -248,6 +264,7 @@ def _become(request: dict[str, Any], fds: list[int]) -> None:
     for place, fd in enumerate(fds, 1):
         os.dup2(fd, place)
         os.close(fd)
+    failures = _failures()
     os.environ.clear()
     os.environ.update(request["environment"])
     _show(request)
@@ -257,14 +274,19 @@ def _become(request: dict[str, Any], fds: list[int]) -> None:
     os.chdir(request["cwd"])
     sys.argv[1:] = request["words"]
     sys.path[1:1] = _other_paths(os.environ)
-    from shmmap import failpoints
+    if failures != _failures():
+        from shmmap import failpoints
 
-    old = failpoints.step
-    new = importlib.reload(failpoints).step
-    if new is not old:
+        old = failpoints.step
+        new = importlib.reload(failpoints).step
         for module in list(sys.modules.values()):
             if getattr(module, "step", None) is old:
                 module.step = new  # type: ignore[attr-defined]
+
+
+def _failures() -> list[str | None]:
+    """Return what `shmmap.failpoints` reads as it is imported."""
+    return [os.environ.get(name) for name in ("SHMMAP_TEST_CRASH", "SHMMAP_TEST_DEFECT")]
 
 
 def _show(request: dict[str, Any]) -> None:
@@ -280,30 +302,125 @@ def _show(request: dict[str, Any]) -> None:
         ctypes.memmove(begin, text, len(text))
 
 
-def _fork(request: dict[str, Any], fds: list[int], *sockets: socket.socket) -> int:
-    """Fork for a request; the fork closes these sockets."""
-    pid = os.fork()
-    if pid:
-        return pid
-    for one in sockets:
-        one.close()
+def _start(request: dict[str, Any], fds: list[int], requests: socket.socket) -> NoReturn:
+    """Run in this fork what was asked for."""
+    requests.close()
     _become(request, fds)
-    runpy.run_module(request["module"], run_name="__main__", alter_sys=True)
-    sys.exit(0)
+    if _starts_children(request["module"], request["words"]):
+        stem = _Stem()
+        for name in _STARTERS:
+            vars(sys.modules[name])["start_child"] = stem.start_child
+    _run(request["module"])
 
 
-def _fork_for_adoption(request: dict[str, Any], fds: list[int], requests: socket.socket) -> int:
+def _starts_children(module: str, words: list[str]) -> bool:
+    """Whether a program is likely to start a live worker, workers, or a process that divides or verifies."""
+    if module == "shmmap.daemon":
+        return "--live-budget" in words or not os.path.isdir(words[0])
+    return module == "shmmap.cli" and (words[:1] in (["publish"], ["prepare"]) or "--trust" in words)
+
+
+def _run(module: str) -> NoReturn:
+    """Run a module as a program, to its end.
+
+    This process ends as `multiprocessing` ends its own: modules that it shares are not taken apart.  That
+    would copy all their memory, and take twenty times the CPU of the fork.
+    """
+    code = 0
+    try:
+        runpy.run_module(module, run_name="__main__", alter_sys=True)
+    except SystemExit as end:
+        if isinstance(end.code, str):
+            raise  # the interpreter prints it
+        code = end.code or 0
+    threading._shutdown()  # type: ignore[attr-defined]
+    atexit._run_exitfuncs()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
+
+
+def _fork_for_adoption(run: Callable[[], NoReturn]) -> int:
     """Fork, and end between: the fork's parent is the nearest ancestor that adopts orphans."""
     ours, theirs = socket.socketpair()
     with ours:
         between = os.fork()
         if between == 0:
             ours.close()
-            theirs.send(str(_fork(request, fds, theirs, requests)).encode())
+            pid = os.fork()
+            if pid == 0:
+                theirs.close()
+                run()
+            theirs.send(str(pid).encode())
             os._exit(0)
         theirs.close()
         os.waitpid(between, 0)
         return int(ours.recv(64))
+
+
+class _Stem:
+    """A fork of a program that is about to run; workers that the program starts are forks of it in turn.
+
+    It is made before the program has threads, ends with it, and does not show the program's environment.
+    """
+
+    def __init__(self) -> None:
+        self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        program = os.getpid()
+        if os.fork() == 0:
+            self._socket.close()
+            die_with(program)
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+            _show({"module": __name__, "words": [], "environment": {}})
+            theirs.send(b"ready")
+            _fork_workers(theirs, program)
+        theirs.close()
+        self._socket.recv(64)
+        self._lock = threading.Lock()
+
+    def start_child(
+        self, module: str, *arguments: str, new_session: bool
+    ) -> tuple[subprocess.Popen[bytes], socket.socket]:
+        """Do what `shmmap.processes.start_child.start_child` does."""
+        refuse_if_replaced(module)
+        ours, theirs = channel()
+        request = _request(module, arguments, os.environ, "/", adopted=new_session)
+        with self._lock, theirs, _adopting():
+            socket.send_fds(self._socket, [json.dumps(request).encode()], [theirs.fileno()])
+            pid = int(self._socket.recv(64))
+        return _Adopted(pid, [sys.executable, "-m", module]), ours
+
+
+def _fork_workers(requests: socket.socket, program: int) -> NoReturn:
+    """Fork workers of a program, whenever it asks for one."""
+    while True:
+        data, fds, _, _ = socket.recv_fds(requests, _REQUEST_BYTES, 1)
+        if not data:
+            os._exit(0)  # the program has ended
+        pid = _fork_for_adoption(partial(_work, json.loads(data), fds[0], requests, program))
+        requests.send(str(pid).encode())
+        os.close(fds[0])
+
+
+def _work(request: dict[str, Any], fd: int, requests: socket.socket, program: int) -> NoReturn:
+    """Be a worker of a program, once this fork is its child."""
+    requests.close()
+    end_s = time.monotonic() + _ADOPTED_S
+    while os.getppid() != program and time.monotonic() < end_s:
+        time.sleep(0.0005)
+    request["words"] = [str(fd), str(program), *request["words"]]
+    _become(request, [os.open(os.devnull, os.O_WRONLY)])
+    _run(request["module"])
+
+
+@contextlib.contextmanager
+def _adopting() -> Iterator[None]:
+    """Have orphans among this process's descendants become its children meanwhile."""
+    _prctl(_PR_SET_CHILD_SUBREAPER, 1)
+    try:
+        yield
+    finally:
+        _prctl(_PR_SET_CHILD_SUBREAPER, 0)
 
 
 def main() -> None:
@@ -317,11 +434,14 @@ def main() -> None:
         data, fds, _, _ = socket.recv_fds(requests, _REQUEST_BYTES, _FDS)
         if not data:
             return
-        request = json.loads(data)
-        if request["adopted"]:
-            answer = _fork_for_adoption(request, fds, requests)
+        start = partial(_start, json.loads(data), fds, requests)
+        if start.args[0]["adopted"]:
+            answer = _fork_for_adoption(start)
         else:
-            answer = os.waitstatus_to_exitcode(os.waitpid(_fork(request, fds, requests), 0)[1])
+            pid = os.fork()
+            if pid == 0:
+                start()
+            answer = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
         for fd in fds:
             os.close(fd)
         requests.send(str(answer).encode())

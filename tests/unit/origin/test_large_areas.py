@@ -52,6 +52,12 @@ def town(corner: float = 0.0) -> NDArray[np.float64]:
     return np.hstack((lower, lower + 20.0))
 
 
+@cache
+def indexed(corner: float = 0.0) -> SpatialIndex:
+    """Index of that town, made in small parts, too; a query does not change it."""
+    return SpatialIndex(town(corner))
+
+
 number = st.floats(-2000.0, 3000.0) | st.integers(-100, 150).map(lambda i: 20.0 * i)
 reach = st.floats(0.0, 3000.0) | st.integers(0, 150).map(lambda i: 20.0 * i)
 circles = st.builds(Circle, number, number, reach)
@@ -69,7 +75,7 @@ def test_the_same_cells_as_one_by_one(area: Area, corner: float) -> None:
         moved = Box(area.min_x + corner, area.min_y + corner, area.max_x + corner, area.max_y + corner)
     else:
         moved = type(area)(area.x + corner, area.y + corner, area.radius)
-    assert SpatialIndex(cells).query(moved).tolist() == np.flatnonzero(moved.overlaps(cells)).tolist()
+    assert indexed(corner).query(moved).tolist() == np.flatnonzero(moved.overlaps(cells)).tolist()
 
 
 @given(circles, st.integers(0, 40))
@@ -77,7 +83,7 @@ def test_the_same_cells_as_one_by_one(area: Area, corner: float) -> None:
 def test_more_than_enough_are_some_of_them(area: Circle, most: int) -> None:
     cells = town()
     right = set(np.flatnonzero(area.overlaps(cells)).tolist())
-    found = SpatialIndex(cells).query(area, most).tolist()
+    found = indexed().query(area, most).tolist()
     assert len(found) == len(set(found))
     if len(right) > most:
         assert most < len(found) <= most + AT_ONCE
@@ -95,7 +101,7 @@ def test_a_circle_that_only_just_reaches_a_corner(direction: float, distance: fl
     nearest = float(np.sqrt(np.min(_nearest(cells, x, y))))
     for radius in (nearest * (1 - 1e-12), nearest, nearest * (1 + 1e-12), nearest + 30.0):
         area = Circle(x, y, radius)
-        assert SpatialIndex(cells).query(area).tolist() == np.flatnonzero(area.overlaps(cells)).tolist()
+        assert indexed().query(area).tolist() == np.flatnonzero(area.overlaps(cells)).tolist()
 
 
 def _nearest(cells: NDArray[np.float64], x: float, y: float) -> NDArray[np.float64]:
@@ -111,7 +117,7 @@ def test_cells_beside_a_circle_are_not_looked_at(centre: tuple[float, float], te
     """The box around it has the whole town, the circle a corner of it."""
     cells = town()
     area = Circle(*centre, 3600.0 * np.sqrt(2) + 5.0)
-    found = SpatialIndex(cells).query(area, 10_000)
+    found = indexed().query(area, 10_000)
     assert 0 < len(found) < 10
     min_x, min_y, max_x, max_y = area.bounds
     around = Box(min_x, min_y, max_x, max_y).overlaps(cells)
@@ -120,7 +126,7 @@ def test_cells_beside_a_circle_are_not_looked_at(centre: tuple[float, float], te
 
 
 def test_a_query_with_a_limit_ends_soon_after_it(tested: list[int]) -> None:
-    index = SpatialIndex(town())
+    index = indexed()
     for area in (Circle(600.0, 600.0, 1e4), Box(0.0, 0.0, 1200.0, 1200.0), AutowareSquare(0.0, 0.0, 1e6)):
         tested.clear()
         assert len(index.query(area, 40)) > 40

@@ -202,7 +202,7 @@ def test_an_upload_may_take_longer_than_silence(web: FaultyWeb) -> None:
 NAMES = b"".join(
     b"<Contents><Key>m/v/%d</Key><LastModified>2026-01-01T00:00:00.000Z</LastModified><Size>5</Size></Contents>"
     % at
-    for at in range(999)
+    for at in range(990)  # of a thousand that are read at a time each begins with another one, for 99 times
 )
 NEXT = b"<NextContinuationToken>more</NextContinuationToken>"
 
@@ -213,7 +213,7 @@ def test_a_listing_that_repeats_is_no_listing(web: FaultyWeb) -> None:
     web.read = lambda _path: b"<ListBucketResult>%s%s</ListBucketResult>" % (NAMES, NEXT)
     assert "its listing repeats without end" in outcome(lambda: sum(1 for _ in store.list("v/")))
     web.read = lambda _path: b"<ListBucketResult>%s</ListBucketResult>" % NAMES
-    assert sum(1 for _ in store.list("v/")) == 999
+    assert sum(1 for _ in store.list("v/")) == 990
 
 
 @pytest.mark.parametrize(
