@@ -220,6 +220,19 @@ class Session:
         """Have an event loop send and receive from now on; see `Connection.drive_by`."""
         return self._connected().drive_by(wake)
 
+    def area(
+        self,
+        area: Area,
+        layers: tuple[str, ...],
+        wait_s: float | None,
+        intent: messages.Intent | None = None,
+    ) -> Steps[CellSet]:
+        """Ask for the cells of an area; see `shmmap.Client.area`."""
+        message = messages.area_to_message(area)
+        return self.cells(
+            lambda n, start, left_s: messages.Area(n, message, layers, left_s, intent, start), wait_s
+        )
+
     def cells(
         self,
         ask: Ask,
@@ -387,6 +400,8 @@ class Session:
         return _whole_id(cell_id, self.welcome)
 
     def _attach(self, handle: Handle, welcome: messages.Welcome, populate: bool) -> Cell:
+        if (cell := self.attacher.attached(handle)) is not None:
+            return cell
         access = self._access
         if access is None or welcome.epoch != self._access_epoch:
             shm_dir = self._shm_dir or welcome.shm_dir
