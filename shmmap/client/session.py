@@ -523,7 +523,7 @@ class _ReplyCells:
         """Return the answer; cells whose segments are still gone count as pending."""
         self._pending += [PendingLayer(self._whole(handle.id), handle.layer) for _, handle in self.gone]
         return CellSet(
-            tuple(self._cells[place] for place in sorted(self._cells)),
+            tuple(map(self._cells.__getitem__, sorted(self._cells))),
             tuple(self._failed),
             tuple(self._pending),
             removed(reply.removed, reply.removed_packed) if removed is not None else (),
