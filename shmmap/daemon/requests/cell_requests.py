@@ -26,7 +26,7 @@ from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.map.catalogue_view import PageNews
 from shmmap.daemon.records import SPACE_CODES, Key, Resident
 from shmmap.daemon.requests import limits
-from shmmap.daemon.requests.differential import difference, holds_few, is_among, warm_difference
+from shmmap.daemon.requests.differential import difference, holds_few, warm_difference
 from shmmap.daemon.requests.waiting_list import CellRequest, Message, WaitingList
 from shmmap.daemon.transport.connection import Connection
 from shmmap.daemon.transport.sessions import Session
@@ -409,7 +409,7 @@ class CellRequests:
         if resident is not None and cache.is_current(resident):
             answer.residents.append(resident)
             return
-        is_held = key in found.held_old or (resident and is_among(resident.version, found.held))
+        is_held = key in found.held_old or (resident and resident.version in found.held)
         if resident is not None and not is_held:
             answer.residents.append(resident)
             answer.stale.add(resident)

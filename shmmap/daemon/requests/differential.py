@@ -229,12 +229,6 @@ def _mark_gone(
     found.removed_packed = pack_versions(gone)
 
 
-def is_among(version: int, ordered: NDArray[np.uint64]) -> bool:
-    """Whether a version is among others, which are in ascending order."""
-    is_held, _ = _compared(np.array([version], np.uint64), ordered)
-    return bool(is_held[0])
-
-
 def _compared(
     current: NDArray[np.uint64], held: NDArray[np.uint64]
 ) -> tuple[NDArray[np.bool_], NDArray[np.uint64]]:
