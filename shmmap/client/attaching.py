@@ -52,10 +52,18 @@ class Attacher:
         self._unmapped: list[int] = []
         self._sinks: list[SimpleQueue[Owned | None]] = []
 
+    def attached(self, handle: Handle) -> Cell | None:
+        """Return the cell of a handle if it is attached already."""
+        known = self._cells.get((handle.version, handle.layer))
+        cell = known() if known is not None else None
+        if cell is not None:
+            cell.stale = handle.stale
+        return cell
+
     def attach(
         self, handle: Handle, cell_id: str, segment: str, access: Access, *, populate: bool = False
     ) -> Cell:
-        """Return the cell of a handle; a cell that is already attached is shared.
+        """Return the cell of a handle; a cell that is `attached` is shared.
 
         Parameters
         ----------
@@ -76,11 +84,7 @@ class Attacher:
         ShmmapWarning
             Points of the cell lie outside its box; issued once per cell.
         """
-        key = (handle.version, handle.layer)
-        known = self._cells.get(key)
-        cell = known() if known is not None else None
-        if cell is not None:
-            cell.stale = handle.stale
+        if (cell := self.attached(handle)) is not None:
             return cell
         attached = attach(
             segment,
@@ -95,9 +99,9 @@ class Attacher:
         )
         cell = Cell(cell_id, segment, handle, attached, access)
         found = _Attached(cell, self._dropped.append)
-        found.key = key
+        found.key = handle.version, handle.layer
         self._forget_dropped()
-        self._cells[key] = found
+        self._cells[found.key] = found
         if (outside := attached.outside_points) and cell_id not in self._named_outside:
             self._named_outside.add(cell_id)
             warn_program(

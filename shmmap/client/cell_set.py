@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Container, Iterable, Iterator, Sequence
+from itertools import chain
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, overload
 
 import numpy as np
@@ -170,9 +171,9 @@ def joined(parts: Sequence[CellSet]) -> CellSet:
     The map may change between two of them: the state named is the first, after which all that changed is new.
     """
     return CellSet(
-        tuple(cell for part in parts for cell in part.cells),
-        tuple(error for part in parts for error in part.failed),
-        tuple(cell for part in parts for cell in part.pending),
+        tuple(chain.from_iterable(part.cells for part in parts)),
+        tuple(chain.from_iterable(part.failed for part in parts)),
+        tuple(chain.from_iterable(part.pending for part in parts)),
         next((part.removed for part in reversed(parts) if part.removed), ()),
         parts[-1].epoch,
         parts[0].map_version,

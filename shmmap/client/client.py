@@ -8,7 +8,7 @@ import os
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial, wraps
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Concatenate, Final, NamedTuple, NoReturn, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, Concatenate, Final, NoReturn, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -18,11 +18,11 @@ from shmmap.client.cell_set import CellSet, Held, HeldCells
 from shmmap.client.connection import until_served
 from shmmap.client.discovery import candidates
 from shmmap.client.session import Session, Steps
-from shmmap.errors import ShmmapError, warn_program
+from shmmap.client.session_state import SessionState
+from shmmap.errors import warn_program
 from shmmap.installed import remember_modules
 from shmmap.lazy_imports import know_names
 from shmmap.protocol import messages
-from shmmap.protocol.messages import Welcome
 from shmmap.segment.process_limits import no_files_left
 
 if TYPE_CHECKING:
@@ -43,102 +43,6 @@ CONNECT_S: Final = 60.0
 RELOAD_S: Final = 60.0
 RELOAD_CELL_S: Final = 60e-6
 """Extra time for reading a map's catalogue: a fixed part, and a part per cell."""
-
-
-class MapOrigin(NamedTuple):
-    """Transform from the map frame back to the coordinates of the files that a map was divided from.
-
-    ``(point + (x, y, z)) / unit`` is the point in the files' coordinate system, in float64.
-
-    Attributes
-    ----------
-    x, y, z : float
-        Offset that `divide` subtracted from each point, metres; 0 if none was subtracted, or if it is not
-        known.
-    crs : str or None
-        Name of the coordinate system, with its EPSG code if the files contain it; None if they name no
-        system.
-    unit_m : tuple of float
-        Length of the system's units in metres, horizontal and vertical; (1, 1) unless another unit was
-        converted.
-    """
-
-    x: float
-    y: float
-    z: float
-    crs: str | None
-    unit_m: tuple[float, float]
-
-
-class SessionState:
-    """What a client knows of its session and the map without asking."""
-
-    _session: Session
-
-    def _repr_html_(self) -> str | None:
-        """Return a table for a notebook, of what is known without a request; None where it cannot be made."""
-        try:
-            from shmmap.client import notebook  # few programs are notebooks
-        except ShmmapError:  # the package was replaced
-            return None
-        return notebook.client_html(self)
-
-    @property
-    def timeout(self) -> float:
-        """Seconds a reply may take, in addition to the time that the request lets the daemon wait."""
-        return self._session.timeout_s
-
-    @property
-    def welcome(self) -> Welcome:
-        """Description of the daemon and its map, as received when the session began."""
-        return self._session.welcome
-
-    @property
-    def endpoint(self) -> str:
-        """Path of the daemon's socket."""
-        return self._session.path
-
-    @property
-    def disconnected_since(self) -> float | None:
-        """`time.monotonic` of when the connection to the daemon broke; None while it stands.
-
-        Known at once when the daemon ends.  The next request connects again by itself.
-        """
-        return self._session.lost_since
-
-    @property
-    def epoch(self) -> int:
-        """Identifier of the daemon run that the session is with."""
-        return self._session.welcome.epoch
-
-    @property
-    def map_version(self) -> int:
-        """State of the map that the last answer described."""
-        return self._session.map_version
-
-    @property
-    def frame_id(self) -> str:
-        """Name of the map frame, as of when the session began."""
-        return self._session.welcome.frame_id
-
-    @property
-    def bounds(self) -> tuple[float, float, float, float] | None:
-        """Box around all cells of the map, (min_x, min_y, max_x, max_y), metres, map frame.
-
-        As of when the session began; None where the map has no cells.
-        """
-        return self._session.welcome.bounds
-
-    @property
-    def map_origin(self) -> MapOrigin:
-        """Where the map frame lies in the world, as of when the session began."""
-        welcome = self._session.welcome
-        return MapOrigin(*welcome.origin, welcome.crs or None, welcome.unit_m)
-
-    @property
-    def session(self) -> Session:
-        """State that all requests of this client share; for use by windows."""
-        return self._session
 
 
 class Client(SessionState):
@@ -253,18 +157,9 @@ class Client(SessionState):
         SegmentError
             This user may not read the segments, or the process has no room for more mappings.
         """
-        specs, message = names("layers", layers), messages.area_to_message(area)
-        sent = given_intent(pose, velocity, heading, route)
-        return self._run(
-            self._answer(
-                lambda wait_s: self._session.cells(
-                    lambda n, start, left_s: messages.Area(n, message, specs, left_s, sent, start), wait_s
-                ),
-                area,
-                wait,
-                strict,
-            )
-        )
+        specs, sent = names("layers", layers), given_intent(pose, velocity, heading, route)
+        ask = partial(self._session.area, area, specs, intent=sent)
+        return self._run(self._answer(ask, area, wait, strict))
 
     def points_around(
         self,
@@ -298,17 +193,10 @@ class Client(SessionState):
         from shmmap.client.points_around import points_around  # only windows and few programs need it
 
         circle = geometry.Circle(x, y, radius, z)
-        specs, message = names("layers", layer), messages.area_to_message(circle)
+        ask = partial(self._session.area, circle, names("layers", layer))
 
         def steps() -> Steps[PointsAround]:
-            found = yield from self._answer(
-                lambda wait_s: self._session.cells(
-                    lambda n, start, left_s: messages.Area(n, message, specs, left_s, None, start), wait_s
-                ),
-                circle,
-                wait,
-                strict,
-            )
+            found = yield from self._answer(ask, circle, wait, strict)
             boxes = np.array([cell.box for cell in found]).reshape(-1, 4)
             return points_around(found.cells, boxes, x, y, radius, covered=found.complete)
 
@@ -350,19 +238,13 @@ class Client(SessionState):
 
         Other parameters and errors are those of `area`.
         """
-        specs, mine = names("layers", layers), HeldCells(held, by_name=by_name)
-        sent = given_intent(pose, velocity, heading, route)
-        return self._run(
-            self._answer(
-                lambda wait_s: self._session.differential(
-                    area, mine, specs, wait_s, sent, populate=populate, timeout_s=timeout
-                ),
-                area,
-                wait,
-                strict,
-                new=not mine.named and not mine.packed,
-            )
+        specs, sent = names("layers", layers), given_intent(pose, velocity, heading, route)
+        mine = HeldCells(held, by_name=by_name)
+        ask = partial(
+            self._session.differential, area, mine, specs, intent=sent, populate=populate, timeout_s=timeout
         )
+        is_new = not mine.named and not mine.packed
+        return self._run(self._answer(ask, area, wait, strict, new=is_new))
 
     def selected(
         self,
@@ -381,16 +263,9 @@ class Client(SessionState):
         An id is the absolute path of the cell's file, or its base name where that is unique.  Other
         parameters and errors are those of `area`.
         """
-        specs = names("layers", layers)
-        wanted, sent = names("ids", ids), given_intent(pose, velocity, heading, route)
-        return self._run(
-            self._answer(
-                lambda wait_s: self._session.selected(wanted, specs, wait_s, sent),
-                None,
-                wait,
-                strict,
-            )
-        )
+        specs, sent = names("layers", layers), given_intent(pose, velocity, heading, route)
+        ask = partial(self._session.selected, names("ids", ids), specs, intent=sent)
+        return self._run(self._answer(ask, None, wait, strict))
 
     @property
     def futures(self) -> Futures:

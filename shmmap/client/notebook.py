@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from shmmap.client.cell import Cell
     from shmmap.client.cell_set import CellSet
-    from shmmap.client.client import SessionState
+    from shmmap.client.session_state import SessionState
 
 MAX_POINTS: Final = 20_000
 _MAX_CELLS: Final = 2_000  # drawn of a set: each takes some microseconds, and a page of its memory

@@ -220,6 +220,19 @@ class Session:
         """Have an event loop send and receive from now on; see `Connection.drive_by`."""
         return self._connected().drive_by(wake)
 
+    def area(
+        self,
+        area: Area,
+        layers: tuple[str, ...],
+        wait_s: float | None,
+        intent: messages.Intent | None = None,
+    ) -> Steps[CellSet]:
+        """Ask for the cells of an area; see `shmmap.Client.area`."""
+        message = messages.area_to_message(area)
+        return self.cells(
+            lambda n, start, left_s: messages.Area(n, message, layers, left_s, intent, start), wait_s
+        )
+
     def cells(
         self,
         ask: Ask,
@@ -387,6 +400,8 @@ class Session:
         return _whole_id(cell_id, self.welcome)
 
     def _attach(self, handle: Handle, welcome: messages.Welcome, populate: bool) -> Cell:
+        if (cell := self.attacher.attached(handle)) is not None:
+            return cell
         access = self._access
         if access is None or welcome.epoch != self._access_epoch:
             shm_dir = self._shm_dir or welcome.shm_dir
@@ -508,7 +523,7 @@ class _ReplyCells:
         """Return the answer; cells whose segments are still gone count as pending."""
         self._pending += [PendingLayer(self._whole(handle.id), handle.layer) for _, handle in self.gone]
         return CellSet(
-            tuple(self._cells[place] for place in sorted(self._cells)),
+            tuple(map(self._cells.__getitem__, sorted(self._cells))),
             tuple(self._failed),
             tuple(self._pending),
             removed(reply.removed, reply.removed_packed) if removed is not None else (),

@@ -5,7 +5,7 @@ Requests are served first.  Then follow the descriptors of loaders and the kerne
 task, memory to free and loads to hand out, step by step.  Files are read and layers computed elsewhere
 (`shmmap.daemon.loading.worker_main`).  A turn lasts from one poll of the descriptors to the next; messages
 that clients send in between wait for the next turn.  Each turn is measured; work other than requests ends the
-turn after `TURN_NS`, and continues in a later turn.
+turn after a moment, and continues in a later turn (`shmmap.daemon.turns`).
 """
 
 from __future__ import annotations
@@ -25,17 +25,11 @@ from shmmap.daemon.requests.dispatch import Defects, Dispatch
 from shmmap.daemon.requests.operators.operator_requests import OperatorRequests
 from shmmap.daemon.telemetry.sampler import IDLE_BEAT_S
 from shmmap.daemon.transport.inbox import Inbox
-from shmmap.daemon.turns import WatchedDescriptors
+from shmmap.daemon.turns import BURST_S, LONG_TURN_NS, TURN_NS, WatchedDescriptors
 from shmmap.protocol.events import LongTurn
 from shmmap.statistics.writer import StatisticsWriter
 
 CLIENTS: Final = "clients"
-TURN_NS: Final = 50_000
-"""Processor time after which a turn begins only requests, and no other step."""
-REQUESTS_S: Final = 0.002
-"""Longest time of serving requests before a round of all other work, and of handing out loads per round."""
-LONG_TURN_NS: Final = 10_000_000
-"""Processor time above which a turn is reported as an event."""
 LONG_TURN_EVENT_S: Final = 1.0
 
 
@@ -81,7 +75,7 @@ class ServingLoop:
     _event_s: float = float("-inf")
     _ready: dict[int, None] = field(default_factory=dict)  # ready descriptors that are not clients'
     _round: Iterator[None] | None = None
-    _requests_s: float = REQUESTS_S  # time left for requests before the round continues
+    _burst_s: float = BURST_S  # time left for requests before the round continues
 
     def stop(self, *, answer: bool = True) -> None:
         """Leave the loop after this turn; without ``answer``, waiting requests are left to the next run."""
@@ -108,16 +102,16 @@ class ServingLoop:
                 self._call(fd)
             else:
                 self._ready[fd] = None
-        if self._requests_s > 0:
+        if self._burst_s > 0:
             self._serve_next()
-            if len(self.inbox) and self._requests_s > 0:
+            if len(self.inbox) and self._burst_s > 0:
                 return
         self._round = self._round or self._other_work()
         for _step in self._round:
             if time.thread_time_ns() - self._turn_began_ns > TURN_NS:
-                self._requests_s = TURN_NS * 1e-9
+                self._burst_s = TURN_NS * 1e-9
                 return
-        self._round, self._requests_s = None, REQUESTS_S
+        self._round, self._burst_s = None, BURST_S
 
     def _poll_timeout_s(self) -> float:
         """Return how long the loop may sleep if nothing arrives."""
@@ -155,7 +149,7 @@ class ServingLoop:
             self._guarded("answers", item.run_step)
         self._guarded("memory", self.cell_events.flush)
         took_s = time.monotonic() - begin_s
-        self._requests_s -= took_s
+        self._burst_s -= took_s
         self.inbox.served(item, took_s)
         if item.is_request and item.is_done:
             self.statistics.add_duration("request", int(took_s * 1e9))
@@ -171,7 +165,7 @@ class ServingLoop:
         self._do_what_is_due(time.monotonic())
         yield
         self._guarded("memory", self.scheduler.free, time.monotonic())
-        end_s = time.monotonic() + REQUESTS_S
+        end_s = time.monotonic() + BURST_S
         while True:
             yield
             self._guarded("memory", self.scheduler.pump, time.monotonic())

@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Turns of the serving loop: descriptors that begin a turn, and time limits of long work in it."""
+"""Turns of the serving loop: the descriptors that begin one, and how long each part of it may take.
+
+A *turn* lasts from one poll to the next.  Requests come first, in a *burst* of `BURST_S`.  Then follows a
+*round* of all other work, in *steps*: a turn begins no further step after `TURN_NS`, and the round goes on in
+the next one.  A step of work over many things, a generator or a `Walk`, ends after `STEP_S`.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +13,14 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Final, Generic, TypeVar
 
+TURN_NS: Final = 50_000
+"""Processor time after which a turn begins no step of a round."""
+STEP_S: Final = 0.0005
+"""Longest time of a step of work over many things, but for the last of them."""
+BURST_S: Final = 0.002
+"""Longest time of requests before a round of all other work, and of handing out loads in a round."""
+LONG_TURN_NS: Final = 10_000_000
+"""Processor time above which a turn is reported as an event."""
 DESCRIPTORS_PER_TURN: Final = 16
 """Descriptors returned per poll, and called again; the kernel begins with those not returned last time."""
 
@@ -58,29 +71,11 @@ class WatchedDescriptors:
         self._epoll.close()
 
 
-TURN_S: Final = 0.0005
-"""Time after which a walk over many things is left to the next turn."""
-
 Item = TypeVar("Item")
 
 
-class Pace:
-    """Time limit of an operator's or a statistics request in its current turn."""
-
-    __slots__ = ("_end_s",)
-
-    def __init__(self) -> None:
-        self._end_s = time.monotonic() + TURN_S
-
-    def pause(self) -> Iterator[None]:
-        """End the turn if its time is used up, and begin the next one."""
-        if time.monotonic() >= self._end_s:
-            yield
-            self._end_s = time.monotonic() + TURN_S
-
-
 class Walk(Generic[Item]):
-    """A walk over many items that takes several turns; without items it is done.
+    """A walk over many items that takes several steps; without items it is done.
 
     Attributes
     ----------
@@ -94,9 +89,9 @@ class Walk(Generic[Item]):
         self._items = iter(items or ())
         self.is_done = items is None
 
-    def for_a_turn(self) -> Iterator[Item]:
-        """Yield items until the turn's time is used up, at least one."""
-        end_s = time.monotonic() + TURN_S
+    def for_a_step(self) -> Iterator[Item]:
+        """Yield items until the step's time is used up, at least one."""
+        end_s = time.monotonic() + STEP_S
         for item in self._items:
             yield item
             if time.monotonic() >= end_s:

@@ -34,8 +34,8 @@ from shmmap.protocol.messages import ErrorReply
 
 NOTHING: Final = Row(0, 0, 0, 0, 0, 0)
 """Row of a chunk without a file."""
-TURN_S: Final = 0.001
-"""Longest time for readers between two turns of the worker while other work waits, seconds."""
+BURST_S: Final = 0.001
+"""Longest time of readers' steps between two turns of the worker while other work waits, seconds."""
 KEYS_PER_STEP: Final = 64
 FEW_CHANGES: Final = 1000
 """Most chunks that are sorted in one step."""
@@ -211,7 +211,7 @@ class Readers:
                 self._ready[session] = works
             after_s = time.perf_counter()
             self._spent_s[session] = self._spent_s.get(session, 0.0) + after_s - before_s
-            if after_s >= begun_s + TURN_S:
+            if after_s >= begun_s + BURST_S:
                 break
             before_s = after_s
 

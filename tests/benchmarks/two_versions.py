@@ -5,6 +5,7 @@
     (cd ../other && python3 -m venv .venv && .venv/bin/pip install -q -e '.[test]')
     python -m tests.benchmarks.two_versions ../other [warm attach load import status] [--pairs 40]
     python -m tests.benchmarks.two_versions ../other ndt device pose
+    python -m tests.benchmarks.two_versions ../other many --pairs 8
 
 The other checkout has its environment in ``.venv``, as this one has.  Printed are the medians of both, the
 median of the paired ratios (this version to the other), and the ratio that it is below with 95 %
@@ -12,6 +13,9 @@ confidence (bootstrap).  Less than 1: this version is faster.
 
 - ``warm``: a warm differential with 40 new cells of 256 held, named and packed, 10th percentile of 300
 - ``attach``: request and attach the cells around a place, a cell's share, 10th percentile of 20
+- ``many``: 19 881 cells, warm: by area and by a differential with nothing held, all attached already; by a
+  client that attaches them all, of one that ends then; and what a differential with all of them held takes of
+  the daemon's processor
 - ``load``: the cells of `load_pcd` into segments, one after the other
 - ``import``: CPU time of importing the client
 - ``status``: CPU time of `shmmap status`, where no daemon is, and of its help
@@ -57,16 +61,17 @@ import numpy as np
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import make_map
 scratch = tempfile.mkdtemp()
-made = make_map(Path(scratch) / "map", columns=20, rows=20, points={points})
+made = make_map(Path(scratch) / "map", columns={side}, rows={side}, points={points})
 one = DaemonProcess(made.root, "--budget", "2G").start()
+clocks = {{}}
 {begin}
 print("up", flush=True)
 for line in sys.stdin:
-    times = []
+    times, clock = [], clocks.get(line.strip(), time.perf_counter)
     for _ in range({rounds}):
-        before = time.perf_counter()
+        before = clock()
         count = {work}
-        times.append((time.perf_counter() - before) / count)
+        times.append((clock() - before) / count)
     print(float(np.percentile(times, 10)) * 1e6, flush=True)
 client.close()
 one.stop()
@@ -97,6 +102,27 @@ _ATTACH = """
 import shmmap
 client = shmmap.connect(one.endpoint)
 client.around(0, 0, radius=500)
+"""
+_MANY = """
+import shmmap
+client = shmmap.connect(one.endpoint, timeout=120.0)
+area = shmmap.Box(-1e4, -1e4, 1e4, 1e4)
+while not (kept := client.area(area, wait=60.0, strict=None)).complete:
+    pass
+assert len(kept) == 141 * 141
+def fresh():
+    with shmmap.connect(one.endpoint) as other:
+        return other.area(area)
+asks = {
+    "attached": lambda: client.area(area),
+    "nothing held": lambda: client.differential(area, []),
+    "fresh": fresh,
+    "held": lambda: client.differential(area, kept),
+}
+clocks["held"] = lambda: int(Path(f"/proc/{one.pid}/schedstat").read_text().split()[0]) / 1e9
+def ask(what):
+    assert len(asks[what]()) == (0 if what == "held" else len(kept))
+    return 1
 """
 _LOAD = """
 import os, sys, tempfile, time
@@ -333,9 +359,9 @@ def write_references(folder: Path) -> tuple[str, str]:
     return str(folder / "cases.json"), str(folder / "clouds.npz")
 
 
-def served(points: int, begin: str, rounds: int, work: str) -> str:
-    """Return a program that measures ``work`` on a daemon of its checkout."""
-    return _SERVED.format(points=points, begin=begin.strip(), rounds=rounds, work=work)
+def served(points: int, begin: str, rounds: int, work: str, *, side: int = 20) -> str:
+    """Return a program that measures ``work`` on a daemon of its checkout, over ``side`` x ``side`` cells."""
+    return _SERVED.format(points=points, begin=begin.strip(), rounds=rounds, work=work, side=side)
 
 
 def main() -> None:
@@ -365,6 +391,10 @@ def main() -> None:
         if what == "warm":
             asks = {"warm, packed": "packed", "warm, named": "named"}
             both(served(30, _WARM, 300, "ask(requests[line.strip()])"), asks)
+        elif what == "many":
+            asks = {"many, held, CPU": "held", "many, attached": "attached"}
+            asks |= {"many, none held": "nothing held", "many, fresh": "fresh"}
+            both(served(1, _MANY, 3, "ask(line.strip())", side=141), asks)
         elif what == "attach":
             both(served(2000, _ATTACH, 20, "len(client.around(0, 0, radius=45))"), {"attach": ""})
         elif what == "load":

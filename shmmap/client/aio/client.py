@@ -15,6 +15,7 @@ import shmmap.client.client as sync
 from shmmap.client.aio.driver import LoopDriver, made_in_thread
 from shmmap.client.client import CONNECT_S
 from shmmap.client.session import Session, Steps
+from shmmap.client.session_state import SessionState
 from shmmap.errors import warn_program
 
 P = ParamSpec("P")
@@ -60,7 +61,7 @@ def _in_thread(
     return awaited
 
 
-class Client(sync.SessionState):
+class Client(SessionState):
     """A session with the daemon for the tasks of one event loop; get one from `connect`.
 
     The coroutines have the parameters, results and errors of the methods of `shmmap.Client` of the same

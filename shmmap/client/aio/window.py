@@ -11,14 +11,13 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final
 
 from shmmap.client.aio.client import Client
-from shmmap.client.arguments import names, number, pose_intent, timeout_s
+from shmmap.client.arguments import number, pose_intent, timeout_s
 from shmmap.client.window.follower import PacedFollower
 from shmmap.client.window.map_window import WindowView
 from shmmap.client.window.refresh import WindowRefresher
-from shmmap.client.window.retention import Retention, RetentionPolicy
+from shmmap.client.window.retention import RetentionPolicy
 from shmmap.client.window.state import EMPTY, WindowState, WindowUpdate, update_between
 from shmmap.errors import BadRequest, InternalError, ShmmapError
-from shmmap.geometry import checked_heights
 from shmmap.protocol.messages import Intent
 
 if TYPE_CHECKING:
@@ -136,14 +135,14 @@ class MapWindow(WindowView):
         if timeout is not None:
             timeout = timeout_s("timeout", timeout)
         client.check_loop()
-        self._client, self._radius, self._layers = client, radius, names("layers", layers)
+        self._client, self._radius = client, radius
         self._refresher = WindowRefresher(
             client,
             radius,
-            layers=self._layers,
+            layers=layers,
             shape=shape,
-            z=checked_heights(z),
-            retention=retention if retention is not None else Retention(),
+            z=z,
+            retention=retention,
             populate=False,  # page faults of a whole cell would hold up the loop
             timeout_s=timeout,
         )

@@ -9,16 +9,17 @@ from collections.abc import Collection, Sequence
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from shmmap.client.arguments import names, number, pose_intent, timeout_s
+from shmmap.client.arguments import number, pose_intent, timeout_s
 from shmmap.client.cell import Cell
-from shmmap.client.client import Client, SessionState, connect
+from shmmap.client.client import Client, connect
 from shmmap.client.points_around import PointsAround, points_around
+from shmmap.client.session_state import SessionState
 from shmmap.client.window.follower import BlockingFollower, Follower, WindowFollower
 from shmmap.client.window.refresh import WindowRefresher
-from shmmap.client.window.retention import Retention, RetentionPolicy
+from shmmap.client.window.retention import RetentionPolicy
 from shmmap.client.window.state import EMPTY, LayerKey, WindowState, WindowUpdate, update_between
 from shmmap.errors import BadRequest, ConnectionLost, ShmmapError
-from shmmap.geometry import Circle, checked_heights
+from shmmap.geometry import Circle
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -29,14 +30,14 @@ class WindowView:
 
     _client: SessionState
     _follower: Follower
-    _layers: tuple[str, ...]
+    _refresher: WindowRefresher
     _radius: float
     _closed = False
     _seen = EMPTY.versions
 
     def __repr__(self) -> str:
         where = "closed" if self._closed else f"of radius {self._radius:g} m"
-        return f"<MapWindow {where}, {len(self.cells)} cells of {', '.join(self._layers)}>"
+        return f"<MapWindow {where}, {len(self.cells)} cells of {', '.join(self._refresher.layers)}>"
 
     def _update(self, state: WindowState) -> WindowUpdate:
         """Return the changes up to a state since the last one that was shown."""
@@ -129,8 +130,8 @@ class WindowView:
         BadRequest
             The circle is invalid, or the window has no such layer.
         """
-        state = self._follower.state
-        name = _layer_name(layer if layer is not None else self._layers[0], self._layers, state.by_layer)
+        state, asked = self._follower.state, self._refresher.layers
+        name = _layer_name(layer if layer is not None else asked[0], asked, state.by_layer)
         Circle(x, y, radius)
         covered = state.covers(x, y, radius, name)
         cells = state.by_layer.get(name)
@@ -223,16 +224,15 @@ class MapWindow(WindowView):
         self._client: Client = (
             client if isinstance(client, Client) else connect(client, instance=instance, name=name)
         )
-        self._layers = names("layers", layers)
         self._follower: WindowFollower | BlockingFollower
         try:
             self._refresher = WindowRefresher(
                 self._client,
                 radius,
-                layers=self._layers,
+                layers=layers,
                 shape=shape,
-                z=checked_heights(z),
-                retention=retention if retention is not None else Retention(),
+                z=z,
+                retention=retention,
                 populate=background,  # page faults, too, should occur in the thread
                 timeout_s=timeout,
             )

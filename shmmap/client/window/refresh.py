@@ -11,14 +11,15 @@ import msgspec
 import numpy as np
 
 import shmmap.geometry as geometry
+from shmmap.client.arguments import names
 from shmmap.client.cell import Cell
 from shmmap.client.cell_set import CellSet, HeldCells
-from shmmap.client.client import SessionState
 from shmmap.client.session import Steps
-from shmmap.client.window.retention import RetentionCandidate, RetentionPolicy
+from shmmap.client.session_state import SessionState
+from shmmap.client.window.retention import Retention, RetentionCandidate, RetentionPolicy
 from shmmap.client.window.state import LayerKey, WindowState
 from shmmap.errors import BadRequest, OverBudget
-from shmmap.geometry import distance_to_boxes
+from shmmap.geometry import checked_heights, distance_to_boxes
 from shmmap.protocol.messages import MAX_NAMED, Intent
 
 _Shape: TypeAlias = type[geometry.Circle] | type[geometry.AutowareSquare]
@@ -40,9 +41,9 @@ class WindowRefresher:
     shape
         ``"circle"`` or ``"square"`` (Autoware's).
     z
-        Heights of interest, or None.
+        (lowest, highest) heights of interest, metres, or None.
     retention
-        Policy for keeping cells that leave the window.
+        Policy for keeping cells that leave the window; None: keep none.
     populate
         Map every page while attaching, not at first access.
     timeout_s
@@ -50,13 +51,15 @@ class WindowRefresher:
 
     Attributes
     ----------
+    layers : tuple of str
+        The layers, as they were requested.
     retained : dict
         Cells outside the window that are kept attached, with the time since when.
 
     Raises
     ------
     BadRequest
-        The shape is unknown, or the radius is invalid.
+        The shape is unknown, or another of these is invalid.
     """
 
     def __init__(
@@ -64,22 +67,22 @@ class WindowRefresher:
         client: SessionState,
         radius: float,
         *,
-        layers: Sequence[str],
+        layers: str | Sequence[str],
         shape: str,
         z: tuple[float, float] | None,
-        retention: RetentionPolicy,
+        retention: RetentionPolicy | None,
         populate: bool,
         timeout_s: float | None = None,
     ) -> None:
         if not isinstance(shape, str) or shape not in _SHAPES:
             raise BadRequest(f"window shape {shape!r} is unknown", hint="use 'circle' or 'square'")
         self._make_area = _SHAPES[shape]
-        self._make_area(0.0, 0.0, radius, z)
         self._client = client
         self._radius = radius
-        self._layers = tuple(layers)
-        self._z = z
-        self._retention = retention
+        self.layers = names("layers", layers)
+        self._z = checked_heights(z)
+        self._make_area(0.0, 0.0, radius, self._z)
+        self._retention = retention if retention is not None else Retention()
         self._populate = populate
         self._timeout_s = timeout_s
         self.retained: dict[LayerKey, tuple[Cell, float]] = {}
@@ -145,7 +148,7 @@ class WindowRefresher:
     ) -> Steps[CellSet]:
         held = HeldCells(state.cells.values(), by_name=by_name and len(state.cells) <= MAX_NAMED)
         return self._client.session.differential(
-            area, held, self._layers, wait_s, pose, populate=self._populate, timeout_s=self._timeout_s
+            area, held, self.layers, wait_s, pose, populate=self._populate, timeout_s=self._timeout_s
         )
 
     def _apply(

@@ -38,8 +38,8 @@ FREE_SHARE: Final = 8
 """Divisor: the first plan is made when less than 1/8 of the budget is free."""
 PLAN_S: Final = 0.25
 """Shortest interval of plans that no load waits for."""
-STEP_S: Final = 0.008
-"""Interval of their steps: they take a twentieth of a core at most."""
+PAUSE_S: Final = 0.008
+"""Interval of their steps: these take a twentieth of a core at most."""
 LOOKS_PER_CALL: Final = 4
 """Segments looked at by one `Evictor.free`: a look takes 15 us, and retiring one is as much work again."""
 
@@ -174,8 +174,8 @@ class Evictor:
         if self._stepped_s >= self._pressure_until_s and not self._will_be_needed:
             return math.inf
         if self._making is not None:
-            return self._stepped_s + STEP_S
-        return max(self._stepped_s + STEP_S, self._plan.now_s + PLAN_S) if self._is_outdated else math.inf
+            return self._stepped_s + PAUSE_S
+        return max(self._stepped_s + PAUSE_S, self._plan.now_s + PLAN_S) if self._is_outdated else math.inf
 
     def run_step(self, now_s: float) -> None:
         """Make a part of the next plan; once it is made, it takes the place of the present one."""

@@ -228,7 +228,7 @@ class Survey:
             answer(self.usage)
             return
         walk = self._walk or self._begin(None)
-        for resident in walk.for_a_turn():
+        for resident in walk.for_a_step():
             self._look_at(resident)
         if walk.is_done:
             self._walk, self.usage = None, self._found

@@ -81,7 +81,7 @@ class LostSegments:
 
     def check_some(self, now_s: float) -> bool:
         """Check whether some segments still exist; return True if that released memory."""
-        return self._retire_lost(self.to_check.for_a_turn(), now_s)
+        return self._retire_lost(self.to_check.for_a_step(), now_s)
 
     def _retire_lost(self, residents: Iterable[Resident], now_s: float) -> bool:
         return sum(self.retire_if_lost(resident, now_s) for resident in residents) > 0

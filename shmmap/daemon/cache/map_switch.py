@@ -144,12 +144,12 @@ class MapSwitch:
         """
         cache = self._cache
         if self._to_free is not None:
-            for _ in self._to_free.for_a_turn():
+            for _ in self._to_free.for_a_step():
                 pass
             if self._to_free.is_done:
                 self._to_free = None
         elif self._unseen is not None:
-            for resident in self._unseen.for_a_turn():
+            for resident in self._unseen.for_a_step():
                 cache.unentered = max(1, cache.unentered - 1)
                 if cache.ledger.resident_named(resident.name) is resident:
                     self._look_at(resident, now_s)

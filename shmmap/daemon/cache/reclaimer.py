@@ -295,7 +295,7 @@ class Reclaimer:
             freed += self._probe(retired, now_s)  # if that fails, it is still due
             heapq.heappop(self.due)
         if not self._to_check.is_done:
-            for resident in self._to_check.for_a_turn():
+            for resident in self._to_check.for_a_step():
                 retired = self.ledger.retired.get(resident.name)
                 if retired is not None:
                     self._look_at(retired, min(now_s, retired.probe_after_s))

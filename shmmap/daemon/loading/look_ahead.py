@@ -100,7 +100,7 @@ class OriginHealth:
 
 PASS_S: Final = 1.0
 """Shortest interval at which all paths are looked along."""
-STEP_S: Final = 0.002
+PER_STEP_S: Final = 0.002
 """... for each step: it takes a twentieth of that."""
 LONGEST_PASS_S: Final = 2.0
 """... and longest: what moves too fast for that is fetched late."""
@@ -405,7 +405,7 @@ class Prefetch:
 
     @property
     def _next_pass_s(self) -> float:
-        interval_s = min(STEP_S * self._steps, LONGEST_PASS_S)
+        interval_s = min(PER_STEP_S * self._steps, LONGEST_PASS_S)
         return self._made_s + (PASS_S if self._is_due else max(PASS_S, interval_s))
 
 

@@ -26,7 +26,7 @@ from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.map.catalogue_view import PageNews
 from shmmap.daemon.records import SPACE_CODES, Key, Resident
 from shmmap.daemon.requests import limits
-from shmmap.daemon.requests.differential import WarmDifference, difference, is_among, warm_difference
+from shmmap.daemon.requests.differential import difference, holds_few, warm_difference
 from shmmap.daemon.requests.waiting_list import CellRequest, Message, WaitingList
 from shmmap.daemon.transport.connection import Connection
 from shmmap.daemon.transport.sessions import Session
@@ -91,18 +91,13 @@ class _Found:
 
 @dataclass(eq=False, slots=True)
 class _Answer:
-    """Cells of a reply; ``outstanding`` are the loads that may bring more."""
+    """Cells of a reply; ``stale`` ones are outdated, ``outstanding`` are the loads that may bring more."""
 
     residents: list[Resident] = field(default_factory=list)
-    handles: list[bytes] = field(default_factory=list)
+    stale: set[Resident] = field(default_factory=set)
     pending: list[PendingCell] = field(default_factory=list)
     failed: list[FailedCell] = field(default_factory=list)
     outstanding: set[Key] = field(default_factory=set)
-
-    def add(self, resident: Resident, *, stale: bool = False) -> None:
-        """Add a segment that is in memory."""
-        self.residents.append(resident)
-        self.handles.append(resident.stale_handle if stale else resident.handle)
 
 
 class CellRequests:
@@ -138,6 +133,8 @@ class CellRequests:
         self._quota = limits.SessionQuota(quota_bytes, cache, clock)
         self._waiting = waiting
         self._leftovers: deque[Iterator[None]] = deque()
+        self._last_area: tuple[Area, int] | None = None
+        self._last_cells: NDArray[np.intp] = np.zeros(0, np.intp)
 
     def __len__(self) -> int:
         return len(self._waiting)
@@ -155,7 +152,7 @@ class CellRequests:
             area = messages.area_from_message(message.area)
         if isinstance(message, Differential):
             limits.check_held(message)
-            if self._answer_warm(session, message, area, layers):
+            if area is not None and self._answer_warm(session, message, area, layers):
                 return
         for layer in layers:
             self._cache.layers.check_reach(layer)
@@ -171,23 +168,23 @@ class CellRequests:
     # --- finding --------------------------------------------------------------------------------
 
     def _answer_warm(
-        self, session: Session, message: Differential, area: Area | None, layers: tuple[str, ...]
+        self, session: Session, message: Differential, area: Area, layers: tuple[str, ...]
     ) -> bool:
         """Answer a differential request at once if it names versions and all cells are in memory."""
         cache = self._cache
-        if len(layers) > 1 or message.start or area is None or area.z is not None:
+        if len(layers) > 1 or message.start or area.z is not None or not holds_few(message):
             return False
         cells, covered = cache.catalogue.query(area, MAX_COMPARED)
         looks_around = cache.catalogue.pages is not None and cache.layers.halo_m(layers) > 0.0
         if not covered or looks_around or len(cells) > MAX_COMPARED:
             return False
-        warm: WarmDifference | None = warm_difference(cache, message, cells, layers[0])
+        warm = warm_difference(cache, message, cells, layers[0])
         if warm is None or len(warm.residents) > MAX_CELLS:
             return False
         if not self._quota.has_room(session, warm.residents):
             return False
         _note_area(session, area, layers)
-        answer = _Answer(warm.residents, [resident.handle for resident in warm.residents])
+        answer = _Answer(warm.residents)
         found = _Found(removed=warm.removed, removed_packed=warm.removed_packed)
         self._reply(session, message, found, answer)
         self._statistics.add("hits", len(answer.residents))
@@ -241,7 +238,7 @@ class CellRequests:
         pages = catalogue.pages
         if pages is not None:
             limits.check_count(pages.cells_surely_in(area) * len(layers))
-        cells, found.covered = catalogue.query(area, limits.MAX_CELLS)
+        cells, found.covered = self._query(area)
         limits.check_count(len(cells) * len(layers))
         if pages is not None:
             needed = cache.pages_around(area, layers)
@@ -251,6 +248,21 @@ class CellRequests:
             found.reason = "offline" if len(found.pages) < len(absent) else ""
             pages.want(needed, 0.0)
         return cells if area.z is None else cache.heights.overlapping(cells, area.z)
+
+    def _query(self, area: Area) -> tuple[NDArray[np.intp], bool]:
+        """Return the known cells of an area, and whether these are all; of too many, more than are admitted.
+
+        Those of the last area that takes several replies are remembered, as long as the map is in this state.
+        In one state only a list of cells that comes in pages changes.
+        """
+        catalogue = self._cache.catalogue
+        asked = area, catalogue.map_version
+        if catalogue.pages is None and self._last_area == asked:
+            return self._last_cells, True
+        cells, covered = catalogue.query(area, limits.MAX_CELLS)
+        if len(cells) > MAX_CELLS:
+            self._last_area, self._last_cells = asked, cells
+        return cells, covered
 
     def _wire_id(self, index: int) -> str:
         return self._cache.wire_id(self._cache.catalogue.id(index))
@@ -310,11 +322,12 @@ class CellRequests:
 
     def _look_up(self, request: CellRequest, found: _Found, now_s: float) -> _Answer:
         """Find the segments of cells, and request loads of cold ones; cut the cells if these are many."""
-        cache, warm = self._cache, self._cache.warm.layers
+        cache, layers = self._cache, self._cache.warm.layers
+        warm = {layer: layers[layer].get for layer in request.layers if layer in layers}
         cells, cold = found.cells, list[tuple[int, str]]()
         residents: list[Resident | None] = []
         for place, (index, layer) in enumerate(cells):
-            resident = warm[layer].get(index) if layer in warm else None
+            resident = warm[layer](index) if layer in warm else None
             resident = resident or cache.find_warm(index, layer, now_s)
             if resident is None:
                 if len(cold) == MAX_COLD:
@@ -340,7 +353,7 @@ class CellRequests:
         distances = self._distances_m(request, cells) if cold else [0.0] * len(cells)
         for cell, resident, distance in zip(cells, residents, distances, strict=True):
             if resident is not None and not request.refused:
-                answer.add(resident)
+                answer.residents.append(resident)
             else:
                 self._look_up_cold(request, found, answer, cell, resident, distance, now_s)
         return answer
@@ -394,11 +407,12 @@ class CellRequests:
             return
         resident = resident or cache.resident(key)
         if resident is not None and cache.is_current(resident):
-            answer.add(resident)
+            answer.residents.append(resident)
             return
-        is_held = key in found.held_old or (resident and is_among(resident.version, found.held))
+        is_held = key in found.held_old or (resident and resident.version in found.held)
         if resident is not None and not is_held:
-            answer.add(resident, stale=True)
+            answer.residents.append(resident)
+            answer.stale.add(resident)
         if self._want(request, cell, key, distance, now_s):
             answer.outstanding.add(key)
         failure = loads.failures.get(key)
@@ -425,9 +439,10 @@ class CellRequests:
 
     def _reply(self, session: Session, message: Message, found: _Found, answer: _Answer) -> None:
         """Send a reply; `_hand_out` does the bookkeeping afterwards."""
-        cache, is_last = self._cache, not found.next_id
+        cache, stale, is_last = self._cache, answer.stale, not found.next_id
+        handles = [one.stale_handle if one in stale else one.handle for one in answer.residents]
         reply = encode_cells(
-            message.request, cache.epoch, cache.catalogue.map_version, answer.handles,
+            message.request, cache.epoch, cache.catalogue.map_version, handles,
             found.removed if is_last else (), found.removed_packed if is_last else b"",
             limits.layers_named(message.layers), covered=found.covered, pending=answer.pending,
             failed=answer.failed, reason=found.reason, next_id=found.next_id,
@@ -484,7 +499,7 @@ class CellRequests:
         """Queue answers to requests that have nothing left to wait for, or no time; do some deferred work."""
         for request in self._waiting.take(now_s):
             self._due(request.session.connection, self._answer_in_turn(request))
-        for _ in Walk(self._deferred()).for_a_turn():
+        for _ in Walk(self._deferred()).for_a_step():
             pass
 
     def _deferred(self) -> Iterator[None]:

@@ -34,16 +34,18 @@ class WarmDifference:
     removed_packed: bytes
 
 
+def holds_few(message: Differential) -> bool:
+    """Whether so little is held that `warm_difference` is the faster one."""
+    return len(message.packed) <= 8 * MAX_WARM_HELD and len(message.held) <= MAX_WARM_HELD
+
+
 def warm_difference(
     cache: CellCache, message: Differential, found: NDArray[np.intp], layer: str
 ) -> WarmDifference | None:
     """Return the difference if the request names versions only and all cells of the area are warm, else None.
 
-    ``found`` are the catalogue indices of the area's cells, ascending.  With very many held cells it is None,
-    too.
+    ``found`` are the catalogue indices of the area's cells, ascending.
     """
-    if len(message.packed) > 8 * MAX_WARM_HELD or len(message.held) > MAX_WARM_HELD:
-        return None
     index = cache.warm
     versions = index.versions(layer, found)
     if versions is None:
@@ -145,10 +147,13 @@ def difference(
         stays.
     """
     check_packed(message.packed)
-    held = np.unique(np.frombuffer(message.packed, "<u8"))
+    held = np.sort(np.frombuffer(message.packed, "<u8"))
+    is_first = np.ones(len(held), np.bool_)
+    is_first[1:] = held[1:] != held[:-1]
+    held = held[is_first]  # a tenth of the time of np.unique
     enough = most + len(held) + len(message.held)  # cells of which ``most`` are lacked
-    current, looked_at, _ = cache.layers.of_cells(area[start : start + enough], layers)
-    has = _among(current[:looked_at], held)
+    current, looked_at, complete = cache.layers.of_cells(area[start : start + enough], layers)
+    has, others = _compared(current[:looked_at], held)
     found = Difference([], looked_at, held)
     if message.held:
         places = {index: place - start for place, index in enumerate(area.tolist())}
@@ -157,11 +162,14 @@ def difference(
     if len(lacked) > most:
         found.looked_at = int(lacked[most - 1]) // len(layers) + 1
         lacked = lacked[lacked < found.looked_at * len(layers)]
-    cells = area[start : start + found.looked_at].tolist()
-    of_cells = (divmod(place, len(layers)) for place in lacked.tolist())
-    found.cells = [(cells[row], layers[column]) for row, column in of_cells]
+    rows, columns = np.divmod(lacked, len(layers))
+    of_layers = [layers[column] for column in columns.tolist()]
+    found.cells = list(zip(area[start + rows].tolist(), of_layers, strict=True))
     if len(held) and start + found.looked_at == len(area):
-        _mark_gone(cache, area, layers, covered, found)
+        if start:
+            current, _, complete = cache.layers.of_cells(area, layers)
+            _, others = _compared(current, held)
+        _mark_gone(cache, area, others.tolist(), covered and complete, found)
     return found
 
 
@@ -202,21 +210,18 @@ def _mark_named(
 
 
 def _mark_gone(
-    cache: CellCache,
-    area: NDArray[np.intp],
-    layers: Sequence[str],
-    covered: bool,
-    found: Difference,
+    cache: CellCache, area: NDArray[np.intp], others: Sequence[int], complete: bool, found: Difference
 ) -> None:
-    """Note the versions that are not current in the area: outdated ones of its cells, and those to drop."""
-    current, _, complete = cache.layers.of_cells(area, layers)
+    """Note of held versions that are not current in the area: outdated ones of its cells, and those to drop.
+
+    ``complete`` is whether all cells of the area and their versions are known.
+    """
     catalogue, of_version = cache.catalogue, cache.warm.of_version
-    others = found.held[~_among(found.held, np.sort(current, axis=None))].tolist()
     inside = set(map(catalogue.id, area.tolist())) if others else ()
     known = {version: of_version[version] for version in of_version.among(others)}
     replaced = {version for version, key in known.items() if key.cell_id in inside}
     found.held_old.update(known[version] for version in replaced)
-    if covered and complete:
+    if complete:
         gone = set(others) - replaced
     else:  # what is not known may be current somewhere in the area
         elsewhere = known.keys() - replaced
@@ -224,14 +229,14 @@ def _mark_gone(
     found.removed_packed = pack_versions(gone)
 
 
-def is_among(version: int, ordered: NDArray[np.uint64]) -> bool:
-    """Whether a version is among others, which are in ascending order."""
-    return bool(_among(np.array([version], np.uint64), ordered)[0])
-
-
-def _among(values: NDArray[np.uint64], ordered: NDArray[np.uint64]) -> NDArray[np.bool_]:
-    """Return which values are among others, which are in ascending order."""
-    if not len(ordered):
-        return np.zeros(values.shape, np.bool_)
-    found: NDArray[np.bool_] = ordered[np.searchsorted(ordered, values) % len(ordered)] == values
-    return found
+def _compared(
+    current: NDArray[np.uint64], held: NDArray[np.uint64]
+) -> tuple[NDArray[np.bool_], NDArray[np.uint64]]:
+    """Return which current versions are held, and the held ones, ascending, that are not among them."""
+    if not len(held):
+        return np.zeros(current.shape, np.bool_), held
+    places = np.searchsorted(held, current) % len(held)
+    has: NDArray[np.bool_] = held[places] == current
+    others = np.ones(len(held), np.bool_)
+    others[places[has]] = False
+    return has, held[others]

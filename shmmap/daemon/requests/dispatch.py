@@ -28,7 +28,6 @@ from shmmap.daemon.telemetry.sampler import Sampler
 from shmmap.daemon.transport.connection import Connection
 from shmmap.daemon.transport.inbox import WorkItem
 from shmmap.daemon.transport.sessions import Session
-from shmmap.daemon.turns import Pace
 from shmmap.errors import BadRequest, InternalError, NoSession, ShmmapError
 from shmmap.logfmt import log
 from shmmap.protocol import messages
@@ -157,9 +156,8 @@ class Dispatch:
 
     def _release(self, session: Session, message: messages.Release) -> Iterator[None]:
         versions = list(session.held) if message.packed is None else unpack_versions(message.packed)
-        pace = Pace()
         for begin in range(0, len(versions), RELEASED_PER_STEP):
-            yield from pace.pause()
+            yield
             self.cells.release(session.drop(versions[begin : begin + RELEASED_PER_STEP]))
         session.connection.reply(encode(messages.Released(message.request)))
 

@@ -26,7 +26,6 @@ from shmmap.daemon.records import Resident
 from shmmap.daemon.requests.operators.operator_pins import OperatorPins
 from shmmap.daemon.telemetry.sampler import client_row
 from shmmap.daemon.transport.sessions import Session, Sessions
-from shmmap.daemon.turns import Pace
 from shmmap.errors import BadRequest, Offline, ShmmapError, UnknownCell
 from shmmap.geometry import Area
 from shmmap.layers.spec import kinds
@@ -295,10 +294,10 @@ class MapQueries:
         return messages.MetadataRow(wire_id, catalogue.version(index), *catalogue.box(index), size, *heights)
 
     def stats(self, message: messages.Stats, usage: Usage) -> Generator[None, None, messages.StatsReply]:
-        """Answer a request for statistics with the result of a survey, some sessions per turn."""
-        statistics, pace, rows = self.cache.statistics, Pace(), list[messages.ClientRow]()
+        """Answer a request for statistics with the result of a survey, some sessions per step."""
+        statistics, rows = self.cache.statistics, list[messages.ClientRow]()
         for one in tuple(self.sessions):
-            yield from pace.pause()
+            yield
             rows.append(_with_share(client_row(one), usage.shares.get(one.slot, Share())))
         return messages.StatsReply(
             message.request,

@@ -4,19 +4,21 @@
 Start-time fair queueing (Goyal, Vin, Cheng, SIGCOMM 1996) with equal weights: every process has a clock that
 runs while its requests are served, and the process furthest behind is next.  A process that was idle starts
 at the current time of the service, so that idling saves nothing up.  Connections of one process take turns.
-Work that takes longer than one turn continues in the next turns of its process, before any other of its
+Work that takes longer than a step continues in the next turns of its process, before any other of its
 requests.  Requests beyond the limits below are refused, not stored.
 """
 
 from __future__ import annotations
 
 import heapq
+import time
 from collections import deque
 from collections.abc import Hashable, Iterator
 from dataclasses import dataclass, field
 from typing import Final, Generic, TypeVar
 
 from shmmap.daemon.transport.connection import Connection
+from shmmap.daemon.turns import STEP_S
 from shmmap.errors import Busy
 from shmmap.protocol.codec import request_number
 from shmmap.statistics.writer import StatisticsWriter
@@ -136,7 +138,8 @@ class WorkItem:
     body, is_multipart
         A request's first frame, and whether it had more.
     work
-        Remaining work, in bounded steps; None before a request is dispatched, and after the last step.
+        Remaining work, which may pause at each ``yield``; None before a request is dispatched, and after the
+        last step.
     is_request
         Whether the item came over the connection, which counts its waiting requests, or from the daemon
         itself.
@@ -163,9 +166,11 @@ class WorkItem:
         """Run the next step; the work is done after its last step, or if the connection has ended."""
         work, self.work, self.is_done = self.work, None, True
         if work is not None and self.connection.open:
+            end_s = time.monotonic() + STEP_S
             for _ in work:
-                self.work, self.is_done = work, False
-                break
+                if time.monotonic() >= end_s:
+                    self.work, self.is_done = work, False
+                    break
 
 
 class Inbox:

@@ -22,9 +22,9 @@ def small_map(tmp_path: Path) -> DividedMap:
 
 
 @pytest.fixture
-def short_turns(monkeypatch: pytest.MonkeyPatch) -> None:
-    """End each turn of work on many things after the first of them."""
-    monkeypatch.setattr("shmmap.daemon.turns.TURN_S", 0.0)
+def short_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """End each step of work on many things after the first of them."""
+    monkeypatch.setattr("shmmap.daemon.turns.STEP_S", 0.0)
 
 
 @pytest.fixture

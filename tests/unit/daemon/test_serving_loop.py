@@ -13,7 +13,7 @@ from typing import NoReturn
 import pytest
 
 from shmmap.daemon.events.cell_events import CellEvents
-from shmmap.daemon.serving_loop import LONG_TURN_NS, TURN_NS
+from shmmap.daemon.turns import LONG_TURN_NS, TURN_NS
 from shmmap.protocol.events import LongTurn, Recent, decode_event
 from tests.support.divided_map import DividedMap
 from tests.unit.daemon.whole_daemon import WholeDaemon

@@ -46,7 +46,7 @@ LEFT_OUT = {"_poll", "_poll_timeout_s", "_do_what_is_due", "follow_moves"}
 @pytest.fixture(autouse=True)
 def long_turns(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let no turn end for what the profiler costs."""
-    monkeypatch.setattr(turns, "TURN_S", 60.0)
+    monkeypatch.setattr(turns, "STEP_S", 60.0)
 
 
 class Walker:

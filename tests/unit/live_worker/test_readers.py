@@ -194,7 +194,7 @@ def test_a_session_that_asks_for_much_waits_for_one_that_asks_for_little(
     served: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A step each by turns, however many requests one of them has."""
-    monkeypatch.setattr(readers, "TURN_S", 0.0)  # a step a turn
+    monkeypatch.setattr(readers, "BURST_S", 0.0)  # a step a turn
     for x in range(1000):
         on_disk(served, ChunkKey(x, 0, 0), Row(1, 100, 0, 0, 0, 1))
     for _ in range(64):
@@ -226,7 +226,7 @@ def test_a_turn_is_short_and_what_is_asked_for_is_found_by_an_index(
     served: Served, monkeypatch: pytest.MonkeyPatch, asked: dict[str, Any], most_in_all: int
 ) -> None:
     """However many chunks there are, beyond an area, before the page, and that did not change."""
-    monkeypatch.setattr(readers, "TURN_S", 0.0)
+    monkeypatch.setattr(readers, "BURST_S", 0.0)
     for x in range(20):
         for y in range(100):
             on_disk(served, ChunkKey(x, y, 0), Row(1, 100, 0, 0, 0, 1))

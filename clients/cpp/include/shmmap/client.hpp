@@ -597,16 +597,10 @@ class Client {
       next = std::move(after_it);
     }
     add_late(whole, late, left_of(wait, end));
-    const auto key = [&whole = whole](const CellPtr& cell) {
-      return std::pair(std::string_view(cell->id),
-                       std::find(whole.layers.begin(), whole.layers.end(), cell->layer) - whole.layers.begin());
-    };
-    std::stable_sort(whole.cells.begin(), whole.cells.end(),
-                     [&](const CellPtr& one, const CellPtr& other) { return key(one) < key(other); });
     return std::move(whole);
   }
 
-  /// Ask again for cells that were pending, and add what has become of them.
+  /// Ask again for cells that were pending, and add what has become of them, in the order of a reply.
   void add_late(Answer& whole, const std::set<std::pair<std::string, std::string>>& late,
                 const std::optional<double>& wait) {
     if (late.empty()) return;
@@ -630,6 +624,12 @@ class Client {
       if (is_late(one.first, one.second)) whole.pending.push_back(std::move(one));
     for (auto& one : again.failed)  // one that is unknown has left the map
       if (one.code != "unknown_cell" && is_late(one.id, one.layer)) whole.failed.push_back(std::move(one));
+    const auto key = [&whole](const CellPtr& cell) {
+      return std::pair(std::string_view(cell->id),
+                       std::find(whole.layers.begin(), whole.layers.end(), cell->layer) - whole.layers.begin());
+    };
+    std::stable_sort(whole.cells.begin(), whole.cells.end(),
+                     [&](const CellPtr& one, const CellPtr& other) { return key(one) < key(other); });
   }
 
   /// Ask once and map the cells of the reply; returns them, and where to go on.

@@ -18,7 +18,6 @@ from shmmap.daemon.loading.loads import BACKGROUND
 from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.records import Key
 from shmmap.daemon.requests.limits import check_count
-from shmmap.daemon.turns import Pace
 from shmmap.errors import BadRequest, OverBudget
 from shmmap.layers.spec import canonical_layers
 from shmmap.protocol import messages
@@ -43,9 +42,8 @@ def cells_named(
     check_count(len(ids))
     known: dict[str, None] = {}
     unknown: list[str] = []
-    pace = Pace()
     for cell in ids:
-        yield from pace.pause()
+        yield
         index, catalogue = cache.index_of(cell), cache.catalogue
         if index is None:
             unknown.append(cell)
@@ -88,9 +86,9 @@ class OperatorPins:
         cells, unknown = yield from cells_named(self.cache, message.ids)
         wanted = [Key(cell, layer) for cell in cells for layer in canonical_layers(message.layers)]
         check_count(len(wanted))
-        new, ledger, pace = dict[Key, int](), self.cache.ledger, Pace()
+        new, ledger = dict[Key, int](), self.cache.ledger
         for key in wanted:
-            yield from pace.pause()
+            yield
             if key not in self._keys:
                 new[key] = self._size(key)
         total = sum(self._keys.values()) + sum(new.values())
@@ -103,7 +101,7 @@ class OperatorPins:
         if len(self._keys) + len(new) > MAX_PINS:
             raise BadRequest(f"more than {MAX_PINS} cells would be pinned", hint="unpin others")
         for key in wanted:
-            yield from pace.pause()
+            yield
             if key not in self._keys:
                 ledger.need(key)
                 self._keys[key] = new[key]
@@ -141,9 +139,9 @@ class OperatorPins:
     def _answer(
         self, request: int, keys: Sequence[Key], unknown: tuple[str, ...]
     ) -> Generator[None, None, messages.Pinned]:
-        rows, pace = list[PinnedCell](), Pace()
+        rows = list[PinnedCell]()
         for key in keys:
-            yield from pace.pause()
+            yield
             rows.append(self._row(key))
         return messages.Pinned(request, tuple(rows), unknown)
 

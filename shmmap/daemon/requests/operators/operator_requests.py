@@ -20,7 +20,6 @@ from shmmap.daemon.prerequisites import group_id
 from shmmap.daemon.requests.operators.operator_pins import OperatorPins, cells_named
 from shmmap.daemon.transport.connection import Peer
 from shmmap.daemon.transport.sessions import Session
-from shmmap.daemon.turns import Pace
 from shmmap.errors import NotPermitted, Offline, ShmmapError
 from shmmap.logfmt import log
 from shmmap.protocol import messages
@@ -182,9 +181,8 @@ class OperatorRequests:
                 chosen += ledger.of_cell(cell)
                 yield
         freed = kept = 0
-        pace = Pace()
         for resident in chosen:
-            yield from pace.pause()
+            yield
             if ledger.resident_named(resident.name) is not resident:
                 continue  # evicted in the meantime
             if resident.key in self.pins:

@@ -16,7 +16,7 @@ import pytest
 
 from shmmap.daemon.cache import eviction_plan, reclaimer
 from shmmap.daemon.cache.eviction_plan import BLOCK, HAND_OUT_GRACE_S
-from shmmap.daemon.cache.evictor import LOOKS_PER_CALL, PLAN_S, PRESSURE_S, STEP_S, Evictor, Freeing
+from shmmap.daemon.cache.evictor import LOOKS_PER_CALL, PAUSE_S, PLAN_S, PRESSURE_S, Evictor, Freeing
 from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.cache.reclaimer import LOOKS_PER_TURN, TICK_S, Reclaimer
 from shmmap.daemon.pins.watch import PinWatch
@@ -359,7 +359,7 @@ def test_of_many_the_first_go_when_all_have_been_looked_at(memory: Memory) -> No
         at_s, steps = evictor.next_s, steps + 1
         evictor.run_step(at_s)
     assert steps == 3
-    assert at_s == pytest.approx(NOW_S + PLAN_S + 2.0 * STEP_S)
+    assert at_s == pytest.approx(NOW_S + PLAN_S + 2.0 * PAUSE_S)
     assert evicted(memory, 1, at_s) == [spare]
     last = memory.publish(1)[0]
     rest = len(some) - 100

@@ -117,7 +117,7 @@ def remove(made: DividedMap, name: str) -> None:
 
 
 @pytest.mark.parametrize("turns", [0, 1, CELLS // 2, CELLS + CELLS // 2, 2 * CELLS + 3])
-@pytest.mark.usefixtures("short_turns")
+@pytest.mark.usefixtures("short_steps")
 def test_requests_meanwhile_are_answered_as_if_it_were_over(
     inner: Inner, made: DividedMap, turns: int
 ) -> None:
@@ -141,7 +141,7 @@ def test_requests_meanwhile_are_answered_as_if_it_were_over(
     assert one.ledger.resident_count == CELLS - 1
 
 
-@pytest.mark.usefixtures("short_turns")
+@pytest.mark.usefixtures("short_steps")
 def test_a_change_during_a_change(inner: Inner, made: DividedMap) -> None:
     one = inner(str(made.root))
     one.everything()
@@ -154,7 +154,7 @@ def test_a_change_during_a_change(inner: Inner, made: DividedMap) -> None:
     assert len(one.everything(2).cells) == CELLS - 5
 
 
-@pytest.mark.usefixtures("short_turns")
+@pytest.mark.usefixtures("short_steps")
 def test_tables_of_many_states_do_not_pile_up(inner: Inner, made: DividedMap) -> None:
     """Also where another state comes before the segments have been checked for the last one."""
 

@@ -20,7 +20,7 @@ from tests.support.divided_map import DividedMap
 from tests.unit.daemon.whole_daemon import WholeDaemon
 
 SEGMENTS = 48
-pytestmark = pytest.mark.usefixtures("short_turns")
+pytestmark = pytest.mark.usefixtures("short_steps")
 
 
 def resident(number: int) -> Resident:

@@ -17,6 +17,7 @@ from shmmap.daemon.requests.dispatch import Dispatch
 from shmmap.daemon.transport.sessions import Session
 from shmmap.errors import BadRequest
 from shmmap.layers.versions import LayerVersions
+from shmmap.origin.catalogue import Catalogue
 from shmmap.protocol.codec import pack_versions, unpack_versions
 from shmmap.protocol.messages import Area, BoxMessage, Cells, Differential, Release, Selected
 from tests.support.divided_map import DividedMap, make_map, random_points
@@ -171,6 +172,43 @@ def test_the_map_changes_between_any_two_replies(
     one.run_until_nothing_waits()
 
 
+@pytest.mark.usefixtures("small_replies")
+def test_an_area_is_searched_once_for_all_its_replies(
+    inner: Inner, small_map: DividedMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Unless the map changes, even if only one cell's file did, or another large area is asked for."""
+    one = inner(small_map.root)
+    one.everything(99)
+    searched, query = [], Catalogue.query
+
+    def counted(catalogue: Catalogue, *asked: Any) -> Any:
+        searched.append(asked)
+        return query(catalogue, *asked)
+
+    monkeypatch.setattr(Catalogue, "query", counted)
+    wanted: list[Area | Differential] = [
+        Area(1, EVERYWHERE),
+        Area(2, EVERYWHERE, TWO),
+        Differential(3, EVERYWHERE, start="0_0.pcd"),
+        Area(4, BoxMessage(-1e4, -1e4, 1e4, 1e4, -1e3, 1e3)),
+    ]
+    for message in wanted:
+        one.all_for(message)
+    assert len(searched) == 2, "an area with heights is another one"
+    other = BoxMessage(-1e3, -1e3, 1e3, 1e3)
+    for _ in zip(one.parts_for(Area(5, EVERYWHERE)), one.parts_for(Area(6, other)), strict=True):
+        pass
+    assert len(searched) > 6
+    for change in (rewrite, add, remove):
+        parts = one.parts_for(Area(7, EVERYWHERE))
+        before = next(parts)
+        change(small_map, 1)
+        small_map.write_metadata()
+        one.reload()
+        known = [cell.id for cell in before.cells] + [cell for part in parts for cell in ids_of(part)]
+        assert {Path(cell).name for cell in known} == {Path(cell).name for cell in small_map.corners}
+
+
 def test_a_request_that_waits_is_found_again_in_the_map_as_it_is_then(
     inner: Inner, small_map: DividedMap
 ) -> None:
@@ -296,8 +334,7 @@ def test_what_came_for_another_client_meanwhile_is_not_loaded_again(inner: Inner
     assert one.statistics.values["loads_started"] == CELLS
 
 
-@pytest.mark.usefixtures("short_turns")
-def test_very_much_is_released_in_several_turns(
+def test_very_much_is_released_in_several_steps(
     inner: Inner, made: DividedMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(dispatch, "RELEASED_PER_STEP", 1)

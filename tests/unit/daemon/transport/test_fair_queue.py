@@ -4,16 +4,22 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from shmmap.daemon.transport import inbox
+from shmmap.daemon.transport.connection import Connection
 from shmmap.daemon.transport.inbox import (
     MAX_PER_PROCESS,
     MAX_PROCESS_BYTES,
     MAX_REMEMBERED,
     FairQueue,
+    WorkItem,
 )
 
 
@@ -154,3 +160,25 @@ def test_what_has_begun_is_remembered_however_many_come() -> None:
         assert serve(turns, 0.0) == "other"
     assert len(turns._lines) <= MAX_REMEMBERED, "idle processes are forgotten"
     assert turns.take() == ("p", "long")
+
+
+@pytest.mark.parametrize(("step_s", "steps"), [(0.0, 10), (60.0, 0)])
+def test_work_pauses_when_its_step_has_taken_long(
+    step_s: float, steps: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(inbox, "STEP_S", step_s)
+    done = []
+
+    def work() -> Iterator[None]:
+        for number in range(10):
+            done.append(number)
+            yield
+
+    connection = cast("Connection", SimpleNamespace(open=True))
+    item, paused = WorkItem(connection, work=work(), is_request=False), 0
+    item.run_step()
+    while not item.is_done:
+        paused += 1
+        assert len(done) == paused
+        item.run_step()
+    assert (paused, len(done)) == (steps, 10)

@@ -67,7 +67,6 @@ def test_a_group_that_does_not_exist() -> None:
 
 SIDE = 9
 CELLS = SIDE * SIDE
-in_parts = pytest.mark.usefixtures("short_turns")
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +102,6 @@ def operator(inner: Inner, made: DividedMap) -> Operator:
     return Operator(one)
 
 
-@in_parts
 def test_everything_is_evicted_in_parts(operator: Operator) -> None:
     ledger = operator.one.ledger
     left = [ledger.resident_count for _ in operator.begin(Evict(5))]
@@ -112,7 +110,6 @@ def test_everything_is_evicted_in_parts(operator: Operator) -> None:
     assert operator.reply_to(5) == Evicted(5, CELLS, 0)
 
 
-@in_parts
 def test_what_is_gone_meanwhile_is_not_evicted_again(operator: Operator) -> None:
     first = operator.begin(Evict(5))
     next(first)
@@ -121,7 +118,6 @@ def test_what_is_gone_meanwhile_is_not_evicted_again(operator: Operator) -> None
     assert operator.reply_to(5).freed + freed == CELLS
 
 
-@in_parts
 def test_named_cells_are_evicted_and_pinned_in_parts(operator: Operator, made: DividedMap) -> None:
     ids = tuple(made.corners)
     assert len(list(operator.begin(Pin(5, (*ids, "nowhere"))))) >= 3 * CELLS
@@ -134,7 +130,6 @@ def test_named_cells_are_evicted_and_pinned_in_parts(operator: Operator, made: D
     operator.one.run_until_nothing_waits()
 
 
-@in_parts
 def test_too_many_pins(operator: Operator, made: DividedMap, monkeypatch: pytest.MonkeyPatch) -> None:
     ids = tuple(made.corners)
     with pytest.raises(BadRequest, match="cells in one request"):
