@@ -336,8 +336,9 @@ def _failures(tree: Path, tests: str, limit_s: float, *words: str) -> list[str]:
         text = output.read()
     if code in (0, 5):  # 5: no tests there
         return []
-    # with all parameters of a test, since theirs may be named with spaces
-    found = list(dict.fromkeys(re.findall(r"^(?:FAILED|ERROR) ([^\s\[]+)", text, re.MULTILINE)))
+    # with all parameters of a test where they are named with spaces
+    name = r"^(?:FAILED|ERROR) ([^\s\[]+(?:\[\S*\](?=\s|$))?)"
+    found = list(dict.fromkeys(re.findall(name, text, re.MULTILINE)))
     return found or [f"exit code {code}: {text[-200:]!r}"]
 
 
