@@ -11,15 +11,16 @@ taken, an fsync left out, nanoseconds for seconds, an error not raised, a condit
 off, a call left out.  The same seed draws the same mutants of the same code.  They are spread over the
 packages and, in each, over the kinds.
 
-``run`` copies the tree, breaks the copy, and runs tests there, stage by stage, until the first failure;
-mutant by mutant.  Each is printed with what caught it, or as a survivor.  A stage is words as pytest takes
-them; ``own`` are the unit tests of the package, ``--all own`` also the slow ones (default: `STAGES`).  Where
-tests fail at random a mutant counts as caught only if the first test that failed passes in the copy that is
-not broken.
+``run`` copies the tree, breaks the copy, and runs tests there, stage by stage, until the first failure.  Each
+mutant is printed with the stage and the test that caught it, or at the end as a survivor.  A stage is words
+as pytest takes them.  ``near`` are those three files of the package's unit tests that mention the mutant's
+module, class and function most, which catch most mutants in seconds; ``own`` are all of them, ``--all own``
+also the slow ones (default: `STAGES`).  Where tests fail at random a mutant counts as caught only if the
+first test that failed passes in the copy that is not broken.
 
-``--together N`` spares most of the time where whole stages are run and few mutants are caught: each stage is
-run once with N mutants in the copy.  What fails then is run with each of them alone, and where some are
-caught the stage is run again with the rest.
+``--together N`` spares most of the time where whole stages are run and few mutants are caught: each stage but
+``near`` is run once with N mutants in the copy.  What fails then is run with each of them alone, and where
+some are caught the stage is run again with the rest.
 
 ``--tree`` is another checkout, such as an older one, whose code is broken and whose tests are run.  ``carry``
 finds its mutants in this one, where the lines that they change stand as they were, in whatever module; the
@@ -31,6 +32,7 @@ from __future__ import annotations
 import argparse
 import ast
 import contextlib
+import functools
 import json
 import os
 import random
@@ -55,8 +57,12 @@ PACKAGES: Final = (
     "shmmap/segment",
     "shmmap/origin",
 )
+NEAR: Final = "near"
+NEAREST: Final = 3
+"""Files of tests that stage `near` has."""
 OWN: Final = "own"
 STAGES: Final = (
+    NEAR,
     OWN,
     "tests/unit",
     "tests/model",
@@ -266,24 +272,54 @@ def carry(mutant: Mutant, old: Path, new: Path) -> Mutant | None:
     return found[0] if len(found) == 1 else None
 
 
-def _is_own(stage: str) -> bool:
-    return OWN in stage.split()
+def own_files(tree: Path, mutant: Mutant) -> list[Path]:
+    """Return the files of the unit tests nearest to a mutant's module; first those that are most about it.
+
+    What is mutated is a module, and in it a class, a function: a file is about it that mentions these names,
+    and a name counts the more the fewer files mention it.  The list is empty if there are no such tests.
+    """
+    source = ast.parse((tree / mutant.path).read_text(encoding="utf-8"))
+    names = {Path(mutant.path).stem}
+    for node in ast.walk(source):
+        if isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            last = node.end_lineno or node.lineno
+            names |= {node.name} if node.lineno <= mutant.line <= last else set()
+    words = {
+        file: set(re.findall(r"\w+", f"{file.stem.removeprefix('test_')} {file.read_text(encoding='utf-8')}"))
+        for file in sorted((tree / _own_folder(tree, mutant.path)).rglob("test_*.py"))
+    }
+    about = dict.fromkeys(words, 0.0)
+    for name in names:
+        mentioning = [file for file in words if name in words[file]]
+        for file in mentioning:
+            about[file] += 1 / len(mentioning)
+    return sorted(words, key=lambda file: -about[file])
 
 
-def _own_tests(tree: Path, path: str) -> str:
-    """Return the folder of unit tests nearest to a module; empty if it has none."""
-    folder = Path(path).parent
-    while folder.parts[1:]:
-        own = Path("tests/unit", *folder.parts[1:])
-        if (tree / own).is_dir():
-            return str(own)
-        folder = folder.parent
-    return ""
+def _own_folder(tree: Path, path: str) -> Path:
+    """Return the folder of unit tests nearest to a module, from the tree's root."""
+    parts = Path(path).parent.parts[1:]
+    while parts and not tree.joinpath("tests/unit", *parts).is_dir():
+        parts = parts[:-1]
+    return Path("tests/unit", *parts)
+
+
+def _tests_of(stage: str, tree: Path, mutant: Mutant) -> str:
+    """Return the words for pytest that a stage means for a mutant."""
+    words = stage.split()
+    if NEAR in words:
+        own = [str(file.relative_to(tree)) for file in own_files(tree, mutant)[:NEAREST]]
+    else:
+        own = [str(_own_folder(tree, mutant.path))]
+    found = []
+    for word in words:
+        found += ["-n", "0", *own] if word in (NEAR, OWN) else [word]
+    return " ".join(found)
 
 
 def _failures(tree: Path, tests: str, limit_s: float, *words: str) -> list[str]:
     """Run tests; returns the names of those that fail, or why there are none to name."""
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *words, *tests.split()]
+    command = [sys.executable, "-m", "pytest", "-q", *words, *tests.split()]
     paths = os.pathsep.join((str(tree), str(tree / "clients")))
     environment = {**os.environ, "PYTHONPATH": paths, "PYTHONDONTWRITEBYTECODE": ""}
     with tempfile.TemporaryFile("w+") as output:
@@ -300,14 +336,24 @@ def _failures(tree: Path, tests: str, limit_s: float, *words: str) -> list[str]:
         text = output.read()
     if code in (0, 5):  # 5: no tests there
         return []
-    # with all parameters of a test, since theirs may be named with spaces
-    found = list(dict.fromkeys(re.findall(r"^(?:FAILED|ERROR) ([^\s\[]+)", text, re.MULTILINE)))
+    # with all parameters of a test where they are named with spaces
+    name = r"^(?:FAILED|ERROR) ([^\s\[]+(?:\[\S*\](?=\s|$))?)"
+    found = list(dict.fromkeys(re.findall(name, text, re.MULTILINE)))
     return found or [f"exit code {code}: {text[-200:]!r}"]
 
 
 def _first_failure(tree: Path, tests: str, limit_s: float, *words: str) -> str:
     """Run tests until one fails; returns its name, or empty."""
     return next(iter(_failures(tree, tests, limit_s, "-x", *words)), "")
+
+
+@functools.cache
+def _fails_anyway(whole: Path, test: str, limit_s: float) -> bool:
+    """Return whether a test fails in the copy that is not broken, too."""
+    fails = bool(_first_failure(whole, test, limit_s, "-n", "0"))
+    if fails:
+        print(f"    {test} fails without a mutant, too", flush=True)
+    return fails
 
 
 @contextlib.contextmanager
@@ -341,45 +387,38 @@ def _groups(numbers: Sequence[int], mutants: Sequence[Mutant], size: int) -> lis
 
 
 def caught_together(
-    group: Sequence[int], mutants: Sequence[Mutant], whole: Path, broken: Path, stage: str, limit_s: float
+    group: Sequence[int], mutants: Sequence[Mutant], whole: Path, broken: Path, tests: str, limit_s: float
 ) -> dict[int, str]:
-    """Return what catches each of a group of mutants in a stage; those that nothing catches are left out."""
+    """Return what catches each of a group of mutants; those that nothing catches are left out.
+
+    A single one needs only the first test that fails.
+    """
+    if len(group) == 1:
+        with _broken(broken, [mutants[group[0]]]):
+            first = _first_failure(broken, tests, limit_s)
+        if not first:
+            return {}
+        if " " in first or not _fails_anyway(whole, first, limit_s):
+            return {group[0]: first}
     caught: dict[int, str] = {}
     while rest := [number for number in group if number not in caught]:
         with _broken(broken, [mutants[number] for number in rest]):
-            failed = _failures(broken, stage, limit_s)
+            failed = _failures(broken, tests, limit_s)
         named = [name for name in failed if " " not in name]
         if failed and not named and len(rest) > 1:  # it does not end, or nothing can be imported
             for half in (rest[::2], rest[1::2]):
-                caught |= caught_together(half, mutants, whole, broken, stage, limit_s)
+                caught |= caught_together(half, mutants, whole, broken, tests, limit_s)
             return caught
         found = {rest[0]: failed[0]} if failed and not named else {}
         for number in rest if named else ():
             with _broken(broken, [mutants[number]]):
-                alone = _first_failure(broken, " ".join(named[:MAX_ALONE]), limit_s)
-            if alone and (" " in alone or not _first_failure(whole, alone, limit_s, "-n", "0")):
+                alone = _first_failure(broken, " ".join(named[:MAX_ALONE]), limit_s, "-n", "0")
+            if alone and (" " in alone or not _fails_anyway(whole, alone, limit_s)):
                 found[number] = alone
         if not found:
             return caught
         caught |= found
     return caught
-
-
-def _caught_by(mutant: Mutant, whole: Path, broken: Path, stages: Sequence[str], limit_s: float) -> str:
-    """Return what catches a mutant; empty if nothing does."""
-    with _broken(broken, [mutant]):
-        for stage in stages:
-            tests, one_at_a_time = stage, tuple[str, ...]()
-            if _is_own(stage):
-                if not (own := _own_tests(whole, mutant.path)):
-                    continue
-                tests, one_at_a_time = stage.replace(OWN, own), ("-n", "0")
-            failed = _first_failure(broken, tests, limit_s, *one_at_a_time)
-            if failed and (" " in failed or not _first_failure(whole, failed, limit_s, "-n", "0")):
-                return failed
-            if failed:
-                print(f"    {failed} fails without it, too", flush=True)
-    return ""
 
 
 def _copy(tree: Path, folder: Path) -> Path:
@@ -390,34 +429,34 @@ def _copy(tree: Path, folder: Path) -> Path:
 def _run(args: argparse.Namespace) -> None:
     mutants = [Mutant(**one) for one in json.loads(args.mutants.read_text(encoding="utf-8"))]
     only = {int(number) for number in args.only.split(",")} if args.only else set(range(len(mutants)))
-    stages = tuple(args.stages) or STAGES
-    caught: dict[int, str] = {}
+    left = sorted(only)
     with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
         whole, broken = _copy(args.tree, Path(folder, "whole")), _copy(args.tree, Path(folder, "broken"))
-        alone = tuple(stage for stage in stages if _is_own(stage)) if args.together > 1 else stages
-        for number in sorted(only):
-            if by := _caught_by(mutants[number], whole, broken, alone, args.limit):
-                caught[number] = by
-            if by or alone == stages:
-                _report(number, mutants[number], by, args.results)
-        for stage in stages[len(alone) :]:
-            left = [number for number in sorted(only) if number not in caught]
-            for group in _groups(left, mutants, args.together):
-                found = caught_together(group, mutants, whole, broken, stage, args.limit)
-                caught |= found
+        for stage in args.stages or STAGES:
+            size = 1 if NEAR in stage.split() else args.together
+            by_tests = defaultdict[str, list[int]](list)
+            for number in left:
+                by_tests[_tests_of(stage, whole, mutants[number])].append(number)
+            groups = [
+                (group, tests)
+                for tests, numbers in by_tests.items()
+                for group in _groups(numbers, mutants, size)
+            ]
+            for group, tests in sorted(groups):
+                found = caught_together(group, mutants, whole, broken, tests, args.limit)
                 for number, by in found.items():
-                    _report(number, mutants[number], by, args.results)
-        if alone != stages:
-            for number in sorted(only - caught.keys()):
-                _report(number, mutants[number], "", args.results)
-    print(f"{len(caught)} of {len(only)} are caught")
+                    _report(number, mutants[number], stage, by, args.results)
+                    left.remove(number)
+    for number in left:
+        _report(number, mutants[number], "", "", args.results)
+    print(f"{len(only) - len(left)} of {len(only)} are caught")
 
 
-def _report(number: int, mutant: Mutant, by: str, results: Path | None) -> None:
-    print(f"{number:3} {mutant}\n    {by or 'SURVIVES'}", flush=True)
+def _report(number: int, mutant: Mutant, stage: str, by: str, results: Path | None) -> None:
+    print(f"{number:3} {mutant}\n    {f'{stage}: {by}' if by else 'SURVIVES'}", flush=True)
     if results is not None:
         with results.open("a", encoding="utf-8") as file:
-            file.write(json.dumps({"number": number, "by": by}) + "\n")
+            file.write(json.dumps({"number": number, "stage": stage, "by": by}) + "\n")
 
 
 def main() -> None:

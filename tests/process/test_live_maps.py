@@ -18,7 +18,8 @@ import shmmap
 from shmmap.chunks.marks import encode_marks
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.client.live.live_map import Sphere
-from shmmap.errors import BadRequest, ConfigError, LiveInterrupted
+from shmmap.client.live.mapper import MAX_UNANSWERED
+from shmmap.errors import BadRequest, Busy, ConfigError, LiveInterrupted, NoAnswer
 from shmmap.failpoints import LIVE_STEPS
 from shmmap.protocol import live as messages
 from shmmap.statistics.reader import StatisticsReader
@@ -304,6 +305,28 @@ def test_requests_that_wait_when_the_worker_dies_are_refused(live_daemon: LiveDa
         assert len(refused) == 1
     with shmmap.connect(one.endpoint, timeout=60.0) as client:
         assert client.live("lidar").name == "lidar"
+
+
+def test_a_mapper_whose_scans_are_not_applied_refuses_more(live_daemon: LiveDaemon) -> None:
+    """It keeps a few, which are applied once the worker goes on; what it refused may be added again."""
+    one = live_daemon()
+    points, pose = drive()[0]
+    with (
+        shmmap.connect(one.endpoint) as client,
+        client.live("lidar").mapper("front", FILTER, timeout_s=0.5) as mapper,
+    ):
+        worker = worker_of(one)
+        os.kill(worker, signal.SIGSTOP)
+        try:
+            for _ in range(MAX_UNANSWERED):
+                mapper.add(points, pose)
+            with pytest.raises((Busy, NoAnswer)):
+                mapper.add(points, pose)
+        finally:
+            os.kill(worker, signal.SIGCONT)
+        waiting = Deadline()
+        while waiting(mapper.applied < MAX_UNANSWERED):
+            pass
 
 
 def test_an_operator_looks_and_saves(live_daemon: LiveDaemon) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.benchmarks.mutants import Mutant, carry, caught_together, draw, mutants_of
+from tests.benchmarks.mutants import Mutant, carry, caught_together, draw, mutants_of, own_files
 from tests.support.daemon_process import ROOT
 
 CODE = """
@@ -131,3 +131,22 @@ def test_mutants_are_found_in_another_checkout(tmp_path: Path) -> None:
     assert places[4, "3"] is None
     assert places[5, "7"] == ("shmmap/large.py", 6)
     assert places[1, "5"] == ("shmmap/package/twice.py", 1)
+
+
+def test_files_about_a_mutants_module_and_function_come_first(tmp_path: Path) -> None:
+    """A name that few files mention counts more; a module without tests in its folder has those above it."""
+    (tmp_path / "shmmap/package/deep").mkdir(parents=True)
+    (tmp_path / "shmmap/package/deep/boxes.py").write_text(
+        "class Box:\n    def rarely(self):\n        return 1\n\ndef other():\n    return 2\n"
+    )
+    tests = tmp_path / "tests/unit/package"
+    tests.mkdir(parents=True)
+    (tests / "test_about_all.py").write_text("Box, other\n")
+    (tests / "test_boxes.py").write_text("Box().open()\n")
+    (tests / "test_nothing.py").write_text("boxed, inbox\n")
+    (tests / "test_rare.py").write_text("Box().rarely()\n")
+    one, two = mutants_of(tmp_path, "shmmap/package")
+
+    first, second = ([file.name for file in own_files(tmp_path, mutant)] for mutant in (one, two))
+    assert first == ["test_boxes.py", "test_rare.py", "test_about_all.py", "test_nothing.py"]
+    assert second[:2] == ["test_about_all.py", "test_boxes.py"]

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from shmmap.errors import MapDataError
 from shmmap.origin.map_directory import open_map
 from shmmap.origin.map_report import (
     REPORT_HEAD,
@@ -18,6 +19,7 @@ from shmmap.origin.map_report import (
     MapFrame,
     far_cells_notes,
     read_map_frame,
+    read_report,
 )
 from tests.support.clouds import cloud_file, divide_quickly
 
@@ -113,3 +115,9 @@ def test_divide_says_so(tmp_path: Path) -> None:
     made = divide_quickly([cloud_file(tmp_path / "a.pcd", {"xyz": xyz})], tmp_path / "map")
     (note,) = made.notes
     assert "km from all others, with 1 point (stray ones?): _9000_0.pcd" in note
+
+
+def test_a_report_that_is_no_file_cannot_be_read(tmp_path: Path) -> None:
+    (tmp_path / REPORT_NAME).mkdir()
+    with pytest.raises(MapDataError, match="cannot be read: Is a directory"):
+        read_report(tmp_path)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import gc
 import os
 import resource
+import select
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -273,6 +274,14 @@ def test_what_others_cut_short_never_comes_back(inner: Inner, small_map: Divided
         assert one.cache.lost.retire_if_lost(first, one.now_s())
         assert load(one, 2) is not first
     one.run_until(lambda: not one.ledger.retired)
+
+
+def test_a_name_that_others_remove_wakes_the_daemon(inner: Inner, small_map: DividedMap) -> None:
+    one = inner(small_map.root)
+    first = load(one, 1)
+    os.unlink(f"{one.shm_dir}{first.name}")
+    assert select.select([one.cache.lost.fd], [], [], 60.0)[0]
+    assert one.cache.lost.vanished() == {first.name}
 
 
 def test_no_descriptors_left(inner: Inner, small_map: DividedMap) -> None:

@@ -62,6 +62,18 @@ def test_turns_are_by_bytes() -> None:
     assert 3 <= sum(one in large for one in served) <= 5
 
 
+def test_a_tiny_load_costs_more_than_its_bytes() -> None:
+    """A tenth of what a megabyte costs, not a millionth."""
+    queue = LoadQueue()
+    large = [load(1_000_000) for _ in range(20)]
+    for one in large:
+        queue.push(one, 0.0, "large")
+    for _ in range(200):
+        queue.push(load(1), 0.0, "tiny")
+    served = [start(queue) for _ in range(100)]
+    assert 7 <= sum(one in large for one in served) <= 10
+
+
 def test_turns_are_by_the_time_that_loads_took_in_the_end() -> None:
     """Small files whose layers take seconds; their client waits while the other one is served."""
     queue = LoadQueue()

@@ -210,6 +210,16 @@ def test_a_version_stands_for_its_layer(served: Served) -> None:
         assert (found.removed, found.removed_packed) == ((), b"")
 
 
+def test_a_cell_held_in_another_layer_alone_is_lacking(served: Served) -> None:
+    """Also where all that is asked for is in memory, which is the quicker way."""
+    name = "-20_-20.pcd"
+    held = HeldCell(name, served.current[name], ("voxel(leaf=1.0)",))
+    message = Differential(1, EVERYWHERE, ("points",), (held,))
+    rows = np.array([served.names.index(name)], dtype=np.intp)
+    warm = warm_difference(served.inner.cache, message, rows, "points")
+    assert warm is None or [resident.version for resident in warm.residents] == [held.version]
+
+
 @pytest.mark.parametrize("packed", [b"1234567", b"123456789"])
 def test_packed_versions_of_broken_length(served: Served, packed: bytes) -> None:
     message = Differential(1, EVERYWHERE, packed=packed)

@@ -134,6 +134,14 @@ def test_a_change_is_saved_in_time_the_oldest_first() -> None:
     assert one.begin_save(in_time, everything=True) is chunks[1]
 
 
+@pytest.mark.parametrize(("budget_bytes", "saved"), [(25, False), (19, True)])
+def test_what_no_client_wants_is_saved_ahead_once_memory_is_half_full(budget_bytes: int, saved: bool) -> None:
+    """Ten bytes: it can be given up at once then; before, more scans may come into the same save."""
+    one = Residency(Limits(budget_bytes, radius=0, saves=1), new_bytes=1)
+    written(one, HERE)
+    assert (one.begin_save(PLENTY.linger_s) is not None) == saved
+
+
 def test_durable_is_what_was_flushed() -> None:
     one = Residency(PLENTY)
     first = scan_of(HERE, ChunkKey(1, 0, 0))

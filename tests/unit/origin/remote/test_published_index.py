@@ -16,6 +16,7 @@ import pytest
 import xxhash
 
 from shmmap.errors import MapDataError
+from shmmap.layers.spec import MAX_SPEC_CHARACTERS
 from shmmap.segment.version import cell_version
 from tests.support.fuzzing import mutate_bytes
 from tests.support.message_pack import pack, unpack
@@ -34,6 +35,7 @@ from shmmap.origin.remote.published_index import (  # noqa: E402
 )
 
 NDT = "ndt(leaf=2.0)"
+NO_SHARD = dict.fromkeys(("shard_keys", "shard_cells", "shard_bytes", "shard_sha256"), b"")
 BOXES = np.array([[-20.0, 0, 0, 20], [0, 0, 20, 20]])
 
 
@@ -194,11 +196,13 @@ def altered(**changes: Any) -> bytes:
         ({"largest_m": [-1.0, 1.0]}, "not positive"),
         ({"layers": {NDT: 1}}, "no points"),
         ({"layers": {"points": -1}}, "builder version"),
+        ({"layers": {"points": 1, "v" * 201: 1}}, "no spec"),
         ({"layers": {"points": 1, **{f"voxel(leaf={i}.5)": 1 for i in range(64)}}}, "too many"),
         ({"cells": 3}, "do not have 3 cells"),
         ({"shard_keys": bytes(16)}, "not of one length"),
         ({"shard_cells": b""}, "not of one length"),
         ({"shard_cells": bytes(4), "cells": 0}, "cells"),
+        ({**NO_SHARD, "cells": 0}, "no shard"),
         ({"shard_bytes": struct.pack("<I", (4 << 20) + 1)}, "larger than"),
         ({"shard_bytes": bytes(4)}, "is empty"),
         ({"shard_sha256": bytes(31)}, "not of one length"),
@@ -222,6 +226,11 @@ def test_a_root_for_later_readers_says_so(changes: dict[str, Any]) -> None:
     with pytest.raises(MapDataError) as error:
         unpack_root(altered(**changes))
     assert (error.value.cause, error.value.hint) == ("newer", "update shmmap")
+
+
+def test_a_layer_may_have_the_longest_spec_there_is() -> None:
+    longest = "v" * MAX_SPEC_CHARACTERS
+    assert longest in unpack_root(altered(layers={"points": 1, longest: 1})).layers
 
 
 def test_what_a_later_root_has_more_is_ignored() -> None:

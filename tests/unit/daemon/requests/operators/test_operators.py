@@ -15,7 +15,7 @@ from shmmap.daemon.map.catalogue_reload import Reloader, Reread
 from shmmap.daemon.requests.operators.operator_pins import MAX_PINS, OperatorPins
 from shmmap.daemon.requests.operators.operator_requests import Authorization, OperatorRequests
 from shmmap.daemon.transport.connection import Peer
-from shmmap.errors import BadRequest, ConfigError, NotPermitted, ShmmapError
+from shmmap.errors import BadRequest, ConfigError, NotPermitted, OverBudget, ShmmapError
 from shmmap.origin.map_directory import open_map
 from shmmap.protocol.messages import Evict, Evicted, Pin, Reload, Reloaded, Unpin
 from tests.support.divided_map import DividedMap, make_map
@@ -141,6 +141,17 @@ def test_too_many_pins(operator: Operator, made: DividedMap, monkeypatch: pytest
     operator.ask(Pin(8, ids[:1]))  # it is already
     operator.ask(Unpin(9))
     assert len(operator.ask(Pin(10, ids[40:80])).cells) == 40
+
+
+def test_pins_stay_within_the_budget(operator: Operator, made: DividedMap) -> None:
+    """What is pinned cannot be evicted: with all pins together nothing else would have room."""
+    ids, ledger = tuple(made.corners), operator.one.ledger
+    operator.ask(Pin(5, ids[:2]))
+    pinned = sum(resident.nbytes for resident in ledger.residents() if resident.key.cell_id in ids[:2])
+    ledger.budget_bytes = pinned + ledger.overhead_bytes
+    with pytest.raises(OverBudget, match="would be pinned; the budget is"):
+        operator.ask(Pin(6, ids[2:3]))
+    assert [cell.id for cell in operator.ask(Pin(7)).cells] == list(ids[:2])
 
 
 def test_a_repeated_request_is_one(inner: Callable[..., InnerDaemon], small_map: DividedMap) -> None:
