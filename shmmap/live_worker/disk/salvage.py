@@ -69,7 +69,7 @@ class Log:
         is_good = is_right & is_current
         follows_good = np.concatenate([[has_header], is_good])[: self.count]
         # whether a frame after a damaged one is right cannot be seen
-        self._is_usable = is_current & (is_good | ~follows_good)
+        self._is_usable = (self._numbers > 0) & is_current & (is_good | ~follows_good)
         self._good = int(np.argmin([*(is_good & has_header), False]))
         commits = np.flatnonzero(is_good & (pages > 0)) + 1
         self.read = int(commits[commits <= self._good].max(initial=0))
