@@ -534,6 +534,21 @@ def test_a_log_of_another_map_is_put_aside(tmp_path: Path, any_body: None) -> No
         assert made.losses(9) == ((), 0)
 
 
+def test_a_log_is_brought_in_at_the_start_or_the_reader_that_keeps_it_is_named(
+    tmp_path: Path, any_body: None
+) -> None:
+    saved = killed(tmp_path / "map", random.Random(3))
+    with database(tmp_path / "map") as reader:
+        reader.execute("begin")
+        reader.execute("select count(*) from chunks").fetchall()
+        with pytest.raises(OSError, match="another process keeps reading"), opened(tmp_path / "map"):
+            pass
+        reader.execute("commit")
+        with opened(tmp_path / "map") as made:
+            assert loaded(made, saved) == saved
+            assert (tmp_path / "map" / "map.db-wal").stat().st_size < 4 * PAGE
+
+
 def test_a_database_that_is_shorter_or_no_database(tmp_path: Path, any_body: None) -> None:
     saved = stored(tmp_path / "good", 60, random.Random(1))
     changes: dict[str, Callable[[bytes], bytes]] = {
