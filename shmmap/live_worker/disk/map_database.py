@@ -303,30 +303,28 @@ class MapDatabase:
         """Add a mapper with a new number, which is on disk when this returns."""
         mapper = Mapper(self.record.next_mapper, uid, name)
         self.record.next_mapper += 1
-        self._write_mappers([*self.mappers, mapper])
+        self._write_change(self.record, "mappers", [*self.mappers, mapper])
         return mapper
 
     def forget_mapper(self, mapper: Mapper) -> None:
         """Forget a mapper; its number is not used again."""
-        self._write_mappers([one for one in self.mappers if one.number != mapper.number])
-
-    def _write_mappers(self, mappers: list[Mapper]) -> None:
-        before, self.record.mappers = self.record.mappers, mappers
-        try:
-            self._write_map()
-        except OSError:
-            self.record.mappers = before
-            raise
+        left = [one for one in self.mappers if one.number != mapper.number]
+        self._write_change(self.record, "mappers", left)
 
     def expect_scan(self, mapper: Mapper, scan: int) -> None:
         """Record on disk that a mapper's scans may have reached this number."""
-        if scan >= (before := mapper.scans):
-            mapper.scans = scan + SCANS_AHEAD
-            try:
-                self._write_map()
-            except OSError:
-                mapper.scans = before
-                raise
+        if scan >= mapper.scans:
+            self._write_change(mapper, "scans", scan + SCANS_AHEAD)
+
+    def _write_change(self, changed: MapRecord | Mapper, name: str, value: object) -> None:
+        """Change a part of the record, on disk; it stays as it was if that fails."""
+        before = getattr(changed, name)
+        setattr(changed, name, value)
+        try:
+            self._write_map()
+        except OSError:
+            setattr(changed, name, before)
+            raise
 
     def write_record(self, applied: dict[int, int] | None = None) -> None:
         """Write the record, and make all saved chunks durable.
