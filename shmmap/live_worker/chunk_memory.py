@@ -215,19 +215,15 @@ class ChunkMemory:
         identity = read_identity(content)
         name = self.name(identity.key, identity.generation)
         fd = os.open(".", os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, 0o600, dir_fd=self._fd)
-        try:
+        with contextlib.ExitStack() as undo:
+            undo.callback(os.close, fd)
             if os.pwrite(fd, content, 0) != len(content):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             self.give_access(fd)
             chunk = self._mapped(name, identity.generation, fd, len(content))
-        except BaseException:
-            os.close(fd)
-            raise
-        try:
+            undo.callback(chunk.unmap)
             os.link(f"/proc/self/fd/{fd}", name.lstrip("/"), dst_dir_fd=self._fd, follow_symlinks=True)
-        except BaseException:
-            chunk.close()
-            raise
+            undo.pop_all()
         return chunk
 
     def open(self, name: str) -> ChunkFile:

@@ -14,6 +14,8 @@ import select
 import socket
 import sys
 import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,8 +26,8 @@ from shmmap.live_settings import LiveSettings
 from shmmap.live_worker.chunk_memory import ChunkMemory, live_prefix
 from shmmap.live_worker.disk.folder import Folder
 from shmmap.live_worker.disk.map_database import MapDatabase
+from shmmap.live_worker.disk.map_record import MapSettings
 from shmmap.live_worker.marks_directory import MarksDirectory
-from shmmap.live_worker.opening import OpeningMap
 from shmmap.live_worker.paging.residency import Limits
 from shmmap.live_worker.served_map import ServedMap
 from shmmap.logfmt import log, set_up_logging
@@ -42,6 +44,101 @@ HOPELESS_S: Final = 10.0
 OTHER_DESCRIPTORS: Final = 512
 """Descriptors and mappings reserved for other purposes than chunks."""
 LEAST_CHUNKS: Final = 64
+LONG_S: Final = 1.0
+"""Time of reading a map's files that is reported as a problem; on a slow disk it ends by itself."""
+RETRY_S: Final = 1.0
+"""Shortest pause after a failed try."""
+PAUSE_FACTOR: Final = 4.0
+"""Ratio of the pause to the duration of the failed try, so that large maps are not read continuously."""
+
+
+class _OpeningMap:
+    """One map that is being opened: a thread reads its files, since a directory may hang.
+
+    Parameters
+    ----------
+    wake
+        Called in the thread when reading the files has succeeded or failed.
+
+    Attributes
+    ----------
+    problem
+        Why the map is not open; empty while the reason is not known.
+    error
+        Error of the last try.
+    """
+
+    def __init__(self, settings: LiveSettings, budget_bytes: int, wake: Callable[[], None]) -> None:
+        self.settings = settings
+        self.problem = ""
+        self.error: BaseException | None = None
+        self._budget_bytes = budget_bytes
+        self._wake = wake
+        self._begun_s = self._retry_s = 0.0
+        self._thread = ThreadPoolExecutor(1, "live-opening")
+        self._reading: Future[tuple[Folder, MapDatabase]] | None = None
+
+    def run_turn(self, now_s: float) -> tuple[Folder, MapDatabase] | None:
+        """Continue; once the files are read, return the directory and the database of a new run."""
+        if self._reading is None:
+            if now_s >= self._retry_s:
+                self._begun_s = now_s
+                self._reading = self._thread.submit(_open_files, self.settings)
+                self._reading.add_done_callback(lambda _: self._wake())
+            return None
+        if not self._reading.done():
+            if now_s >= self._begun_s + LONG_S and not self.problem:
+                path = self.settings.path
+                self._note(f"its files are being read, which takes long: is {path} slow, or does it hang?")
+            return None
+        read, self._reading = self._reading, None
+        if (error := read.exception()) is None:
+            return read.result()
+        self.failed(error, now_s)
+        return None
+
+    def failed(self, error: BaseException, now_s: float) -> None:
+        """Record an error of opening as the map's problem until a try succeeds."""
+        self.error = error
+        self._retry_s = now_s + max(RETRY_S, PAUSE_FACTOR * (now_s - self._begun_s))
+        self._note(f"it cannot be opened: {_reason(error)}")
+
+    def _note(self, problem: str) -> None:
+        if problem != self.problem:
+            self.problem = problem
+            log.error("live map not open", map=self.settings.name, path=self.settings.path, reason=problem)
+
+    def next_turn_s(self, now_s: float) -> float:
+        """Return when the next turn is due."""
+        if self._reading is None:
+            return max(now_s, self._retry_s)
+        return max(now_s, self._begun_s + LONG_S) if not self.problem else now_s + LONG_S
+
+    def status(self) -> LiveMapRow:
+        """Return the map's state, with no chunk in memory."""
+        return messages.not_served(self.settings, self._budget_bytes, self.problem)
+
+
+def _open_files(settings: LiveSettings) -> tuple[Folder, MapDatabase]:
+    """Open a map's directory and read it; a new run of the map begins."""
+    with contextlib.ExitStack() as undo:
+        folder = Folder(settings.path)
+        undo.callback(folder.close)
+        fixed = MapSettings(settings.resolution, settings.occupancy, settings.frame_id)
+        database = MapDatabase(folder, fixed)
+        undo.callback(database.close)
+        database.begin_run()
+        undo.pop_all()
+    return folder, database
+
+
+def _reason(error: BaseException) -> str:
+    if isinstance(error, ShmmapError):
+        return error.message
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    log.error("unexpected error of a live map's files", kind=type(error).__name__, reason=str(error))
+    return f"{type(error).__name__}: {error}"
 
 
 class _Worker:
@@ -59,7 +156,7 @@ class _Worker:
             self._poller.register(readable, select.POLLIN)
         self._wanted = wanted
         self._budget_bytes = wanted.budget_bytes // max(1, len(wanted.maps))  # of each map
-        self._opening = {one.name: OpeningMap(one, self._budget_bytes, self._wake) for one in wanted.maps}
+        self._opening = {one.name: _OpeningMap(one, self._budget_bytes, self._wake) for one in wanted.maps}
         self._maps: dict[str, ServedMap] = {}
         self._closing: dict[str, contextlib.ExitStack] = {}
         self._ending: messages.End | None = None
@@ -233,7 +330,7 @@ class _Worker:
 
     def _rows(self) -> tuple[LiveMapRow, ...]:
         """Return the state of all maps, in the order of the settings."""
-        known: dict[str, ServedMap | OpeningMap] = {**self._opening, **self._maps}
+        known: dict[str, ServedMap | _OpeningMap] = {**self._opening, **self._maps}
         return tuple(known[one.name].status() for one in self._wanted.maps)
 
     # --- the end --------------------------------------------------------------------------------

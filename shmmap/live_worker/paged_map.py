@@ -47,7 +47,7 @@ FILES_PER_JOB: Final = 8
 CHUNKS_PER_TURN: Final = 64
 """Chunks to which scans are applied in one turn, 37 us each."""
 LOOK_S: Final = 2.0
-"""Interval of checks whether the directory was moved or replaced."""
+"""Interval of checks whether the directory, or a file of the database, was moved or replaced."""
 HANGS_S: Final = 10.0
 """Time without an answer after which a disk counts as hanging."""
 
@@ -227,35 +227,37 @@ class PagedMap:
         OSError
             A chunk cannot be opened; it stays in memory for the next try.
         """
-        memory, undone = self.memory, self._undo.of
-        newest: dict[ChunkKey, tuple[int, str]] = {}
-        for name, key, generation in list(memory.names()):
-            if key not in newest or newest[key][0] < generation:
-                newest[key] = (generation, name)
-        for name, key, generation in list(memory.names()):
+        memory = self.memory
+        newest: set[ChunkKey] = set()
+        for name, key, _ in sorted(memory.names(), key=lambda one: -one[2]):
             chunk = self._left_behind(name)
             if chunk is None:
                 memory.remove(name)
-                continue
-            if newest[key] != (generation, name) or int(chunk.view.state["state"]) == OUT_OF_SERVICE:
+            elif key in newest or int(chunk.view.state["state"]) == OUT_OF_SERVICE:
                 memory.give_up(chunk)  # it was saved and about to be evicted
-                continue
-            try:
-                if undone == (key, generation):
-                    self._undo.restore(chunk.view)
-                check_consistent(chunk.view, name)
-                if int(chunk.view.state["version"]) < self.database.version(key):
-                    raise SegmentCorrupt(f"{name}: older than its file")
-            except SegmentCorrupt as error:
-                log.warning("chunk not adopted", chunk=key.text, reason=error.message)
-                memory.give_up(chunk)
-                continue
-            self.add_chunk(chunk, now_s)
-        if undone is not None:
+            else:
+                self._take_over(chunk, now_s)
+            newest.add(key)
+        if self._undo.of is not None:
             self._undo.drop()
         if memory.foreign:
             log.warning("foreign files ignored", count=len(memory.foreign), first=min(memory.foreign))
         return len(self.chunks)
+
+    def _take_over(self, chunk: ChunkFile, now_s: float) -> None:
+        """Add a chunk that a previous writer left, if it is whole and no older than its file."""
+        identity, state = chunk.view.identity, chunk.view.state
+        try:
+            if self._undo.of == (identity.key, identity.generation):
+                self._undo.restore(chunk.view)
+            check_consistent(chunk.view, chunk.name)
+            if int(state["version"]) < self.database.version(identity.key):
+                raise SegmentCorrupt(f"{chunk.name}: older than its file")
+        except SegmentCorrupt as error:
+            log.warning("chunk not adopted", chunk=identity.key.text, reason=error.message)
+            self.memory.give_up(chunk)
+        else:
+            self.add_chunk(chunk, now_s)
 
     def _left_behind(self, name: str) -> ChunkFile | None:
         """Open a chunk of this map; return None if it is invalid, raise OSError if it cannot be opened."""
@@ -357,27 +359,26 @@ class PagedMap:
         self._threads.start(jobs)
         if residency.flush_is_due(now_s, everything=save_all):
             residency.durability.begin()
-            self._threads.start([Job(self.database.flush, self._flushed)])
+            self.on_disk(self.database.flush, self._flushed)
 
     def _check_directory(self, now_s: float, *, save_all: bool) -> None:
         hangs = self._threads.idle_s(now_s) > HANGS_S
         self._note("hangs", "its directory does not answer: its disk is stopped or away" if hangs else "")
         if now_s >= self._look_s and not save_all:
             self._look_s = math.inf  # until this check has ended
-            self._threads.start([Job(self._look, self._checked)])
+            self.on_disk(self._look, self._checked)
 
     def _look(self) -> str:
         self.database.look_again()
-        return self.database.folder.moved()
+        return self.database.moved()
 
     def _checked(self, future: Future[str], now_s: float) -> None:
         self._look_s = now_s + LOOK_S
         moved = future.result()
-        text = f"its directory: {moved}; what is saved goes to where it was opened" if moved else ""
-        self._note("moved", text)
+        self._note("moved", f"{moved}; what is saved goes to where it was opened" if moved else "")
 
-    def _note(self, what: str, problem: str) -> None:
-        """Record a problem or its end; logged once."""
+    def _note(self, what: str, problem: str = "") -> None:
+        """Record a problem or its end; logged once: work is retried each second."""
         if problem and what not in self.problems:
             log.error("live map has a problem", reason=problem)
         if problem:
@@ -417,10 +418,10 @@ class PagedMap:
                 known_mappers=known,
             )
         except OSError as error:  # no memory: treated as if the budget did not allow it
-            self._failed("enlarged", chunk.key.text, _reason(error))
+            self._note("enlarged", f"chunk {chunk.key.text} cannot be enlarged: {_reason(error)}")
             self.residency.may_grow(chunk, self.limits.budget_bytes)
             return
-        self._succeeded("enlarged")
+        self._note("enlarged")
         version, active = int(file.view.state["version"]), int(file.view.state["active"])
         self.residency.applied(chunk, scan, version=version, nbytes=file.nbytes, active=active, now_s=now_s)
         self._observer.chunk_changed(chunk.key)
@@ -447,10 +448,10 @@ class PagedMap:
         try:
             file = future.result()
         except (OSError, MemoryError, PackageMissing) as error:
-            self._failed("loaded", chunk.key.text, str(error))
+            self._note("loaded", f"chunk {chunk.key.text} cannot be loaded: {error}")
             self.residency.load_failed(chunk, now_s)
             return
-        self._succeeded("loaded")
+        self._note("loaded")
         if chunk.key not in self.database.rows:
             self.stored.discard(chunk.key)
         self.chunks[chunk.key] = file
@@ -475,10 +476,10 @@ class PagedMap:
         try:
             future.result()
         except (OSError, MemoryError) as error:
-            self._failed("saved", chunk.key.text, _reason(error))
+            self._note("saved", f"chunk {chunk.key.text} cannot be saved: {_reason(error)}")
             self.residency.save_failed(chunk, now_s)
             return
-        self._succeeded("saved")
+        self._note("saved")
         self.saved_s = now_s
         self.stored.add(chunk.key)
         self.residency.saved(chunk, version, now_s)
@@ -494,30 +495,21 @@ class PagedMap:
             problems.append(f"chunk {key.text} cannot be read: {reason}{more}")
         return "; ".join(problems)
 
-    def _failed(self, what: str, key: str, reason: str | None) -> None:
-        if what not in self.problems:  # logged once: it is retried each second
-            log.warning(f"chunk not {what}", chunk=key or None, reason=reason)
-        self.problems[what] = f"chunk {key} cannot be {what}: {reason}" if key else f"not {what}: {reason}"
-
-    def _succeeded(self, what: str) -> None:
-        if self.problems.pop(what, ""):
-            log.info(f"chunks are {what} again")
-
     def _flushed(self, future: Future[None], now_s: float) -> None:
         try:
             future.result()
         except (OSError, MemoryError) as error:
-            self._failed("flushed", "", _reason(error))
+            self._note("flushed", f"not flushed: {_reason(error)}")
             self.residency.durability.failed(now_s + RETRY_S)
             return
-        self._succeeded("flushed")
+        self._note("flushed")
         self.saved_s = now_s
         for scan in self.residency.durability.flushed():
             self._observer.scan_durable(scan)
 
     def write_record(self, applied: dict[int, int] | None) -> None:
         """Write the record in a file thread; ``applied`` as in `MapDatabase.write_record`."""
-        self._threads.start([Job(partial(self.database.write_record, applied), self._recorded)])
+        self.on_disk(partial(self.database.write_record, applied), self._recorded)
 
     def _recorded(self, future: Future[None], now_s: float) -> None:
         del now_s
@@ -528,7 +520,7 @@ class PagedMap:
 
     def finish(self, applied: dict[int, int] | None) -> None:
         """Write the record and bring the log into the database, at the end."""
-        self._threads.start([Job(partial(self._finish, applied), self._recorded)])
+        self.on_disk(partial(self._finish, applied), self._recorded)
         while not self._threads.are_idle and (left_s := self._left_s()) > 0:
             self._threads.wait(left_s)
             self._threads.deliver(time.monotonic())

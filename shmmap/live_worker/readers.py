@@ -23,10 +23,9 @@ from shmmap.errors import BadRequest, CannotWrite, InternalError, ShmmapError
 from shmmap.live_messages import Ask
 from shmmap.live_worker.areas import check_area, key_range, touches
 from shmmap.live_worker.disk.map_record import Row
-from shmmap.live_worker.lacking import lacking_chunks, shown
 from shmmap.live_worker.paged_map import FileThreads, Job, PagedMap
 from shmmap.live_worker.paging.key_index import KeyIndex, merged_part
-from shmmap.live_worker.voxel_lists import Later, Steps, VoxelLists
+from shmmap.live_worker.voxel_lists import Later, Steps, VoxelLists, lacking_chunks, shown
 from shmmap.logfmt import log
 from shmmap.protocol import live as messages
 from shmmap.protocol.areas import LiveArea

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
-from typing import Final, Protocol, TypeVar
+from typing import Any, Final, TypeVar
 
 import msgspec
 
@@ -46,10 +46,6 @@ MAX_LOSSES: Final = 64
 """Most lost chunks and damaged databases that are named; all are counted."""
 FILES_S: Final = 0.5
 """Interval at which the sizes of files are summed."""
-
-
-class _Reply(Protocol):
-    request: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +90,7 @@ class ServedMap:
         memory: ChunkMemory,
         limits: Limits,
         marks: MarksDirectory,
-        answer: Callable[[int, _Reply], None],
+        answer: Callable[[int, Any], None],
         wake: Callable[[], None] = lambda: None,
         codec: str = "zlib",
     ) -> None:

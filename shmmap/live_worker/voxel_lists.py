@@ -16,7 +16,7 @@ import mmap
 import os
 import secrets
 import time
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Final
@@ -28,10 +28,10 @@ from shmmap.chunks.layout import ChunkView
 from shmmap.chunks.reading import select_voxels
 from shmmap.chunks.voxels import ChunkKey, voxel_centers
 from shmmap.errors import MapDataError, OverBudget
-from shmmap.live_worker.areas import inside
-from shmmap.live_worker.lacking import lacking_chunks, shown
+from shmmap.live_worker.areas import inside, touches
 from shmmap.live_worker.paged_map import PagedMap
-from shmmap.protocol.live import LiveVoxels, LiveVoxelsReply
+from shmmap.protocol.areas import LiveArea
+from shmmap.protocol.live import MAX_LACKING, LackingChunk, LiveVoxels, LiveVoxelsReply
 
 LISTS_PER_SESSION: Final = 4
 VOXEL_BYTES: Final = 14
@@ -45,6 +45,7 @@ ASK_AGAIN_S: Final = 0.005
 FILES_PER_STEP: Final = 8
 """Chunks that a thread reads for a list before it serves others."""
 BYTES_PER_STEP: Final = 256 << 10
+LOST_PER_STEP: Final = 64
 NAME: Final = "voxels."
 
 _Part = tuple[NDArray[np.int32], NDArray[np.int16]]
@@ -280,6 +281,23 @@ class VoxelLists:
                 finally:
                     os.close(fd)
             os.unlink(path)
+
+
+def lacking_chunks(paged: PagedMap, area: LiveArea | None) -> Generator[None, None, dict[ChunkKey, str]]:
+    """Return the chunks that touch an area and have lost something, and what; yield after each step."""
+    found: dict[ChunkKey, str] = {}
+    for number, (key, one) in enumerate(dict(paged.database.lost).items(), 1):
+        if touches(area, key, paged.resolution):
+            found[key] = one.text
+        if number % LOST_PER_STEP == 0:
+            yield None
+    return found
+
+
+def shown(lacking: Mapping[ChunkKey, str]) -> tuple[tuple[LackingChunk, ...], int]:
+    """Return the first of these chunks, as many as an answer names, and the number of all."""
+    rows = [LackingChunk(key, lacking[key]) for key in sorted(lacking)[:MAX_LACKING]]
+    return tuple(rows), len(lacking)
 
 
 def _pages(nbytes: int) -> int:

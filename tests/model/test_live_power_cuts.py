@@ -19,7 +19,7 @@ from shmmap.chunks.layout import ChunkView, new_header
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.live_worker.disk.folder import Folder
 from shmmap.live_worker.disk.map_database import MapDatabase
-from shmmap.live_worker.disk.map_record import MapSettings
+from shmmap.live_worker.disk.map_record import MapSettings, boot_id
 
 SETTINGS = MapSettings(resolution=0.1)
 PAGE = 4096
@@ -91,7 +91,7 @@ class Disk:
         found.mkdir()
         (found / "map.db").write_bytes(database)
         (found / "map.db-wal").write_bytes(log)
-        (found / "map.json").write_bytes(self.read("map.json"))
+        (found / "map.json").write_bytes(self.read("map.json").replace(boot_id().encode(), b"before"))
         with closing(Folder(found)) as folder, closing(MapDatabase(folder, SETTINGS)) as again:
             assert (again.lost, again.damaged) == ({}, {})
             assert again.map_id == self.database.map_id

@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 
 from shmmap.formats.durable_file import appearing_file
-from shmmap.live_worker.disk.folder import Folder, replace_file
 
 Steps = list[tuple[str, object]]
 
@@ -48,11 +47,3 @@ def test_a_file_that_appears(tmp_path: Path, steps: Steps, replace: bool) -> Non
     with appearing_file(tmp_path / "town.yaml", replace=replace) as file:
         file.write(b"x" * 3000)
     assert steps == [("bytes", 3000), ("name", "town.yaml"), ("names", tmp_path.name)]
-
-
-def test_a_file_of_a_live_map(tmp_path: Path, steps: Steps) -> None:
-    folder = Folder(tmp_path)
-    replace_file(folder, "map.json", b"x" * 3000)
-    folder.sync_names()
-    folder.close()
-    assert steps == [("bytes", 3000), ("name", "map.json"), ("names", tmp_path.name)]

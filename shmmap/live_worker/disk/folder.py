@@ -11,7 +11,6 @@ import contextlib
 import errno
 import fcntl
 import os
-import secrets
 import stat
 from collections.abc import Iterator
 from itertools import count
@@ -25,19 +24,8 @@ DAMAGED: Final = ".damaged."
 """Infix between the original name of a damaged file that was put aside and a number."""
 MAX_BYTES: Final = 1 << 28
 """Most bytes that are read from a file: more than an undamaged file can have."""
-
-
-def replace_file(folder: Folder, name: str, data: bytes) -> None:
-    """Write a file to disk, replacing any file of its name; `sync_names` makes the name durable."""
-    interim = f".{name}.{secrets.token_hex(4)}{INTERIM}"
-    try:
-        folder.write(interim, data)
-        folder.sync(interim)
-        folder.rename(interim, name)
-    except OSError:
-        with contextlib.suppress(OSError):
-            folder.remove(interim)
-        raise
+_TO_READ: Final = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY
+"""A pipe or a device would block the opener otherwise."""
 
 
 def free_name(folder: FolderToRead, start: str) -> str:
@@ -73,7 +61,7 @@ def _require_regular(mode: int, name: str) -> None:
 
 
 class FolderToRead:
-    """Files of a directory that another process may be changing: each read returns one consistent version.
+    """Files of a directory that another process may be changing.
 
     Raises
     ------
@@ -106,33 +94,24 @@ class FolderToRead:
         """Return the length of a file, bytes."""
         return os.stat(name, dir_fd=self._fd, follow_symlinks=False).st_size
 
-    def _open(self, name: str, flags: int) -> int:
-        # a pipe or a device of that name would block the opener
-        flags |= os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY
+    def is_in_use(self) -> bool:
+        """Return whether a daemon works with the directory at present."""
         try:
-            return os.open(name, flags, 0o600, dir_fd=self._fd)
-        except OSError as error:
-            if error.errno == errno.ELOOP:
-                raise OSError(errno.ELOOP, "it is a symbolic link, not a regular file", name) from error
-            raise
+            fcntl.flock(self._fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        fcntl.flock(self._fd, fcntl.LOCK_UN)
+        return False
 
     def read(self, name: str, most: int = MAX_BYTES) -> bytes:
         """Return the first ``most`` bytes of a file; raise OSError if it is no regular file."""
-        while True:
-            fd = self._open(name, os.O_RDONLY)
-            try:
-                before = os.fstat(fd)
-                _require_regular(before.st_mode, name)
-                left = min(before.st_size, most)
-                parts = []
-                while left and (part := os.read(fd, left)):
-                    parts.append(part)
-                    left -= len(part)
-                after = os.fstat(fd)
-                if (before.st_mtime_ns, before.st_size) == (after.st_mtime_ns, after.st_size):
-                    return b"".join(parts)
-            finally:  # otherwise another file has the name now, and this one was overwritten
-                os.close(fd)
+        fd = os.open(name, _TO_READ, dir_fd=self._fd)
+        try:
+            _require_regular(os.fstat(fd).st_mode, name)
+            with open(fd, "rb", closefd=False) as file:
+                return file.read(most)
+        finally:
+            os.close(fd)
 
 
 class Folder(FolderToRead):
@@ -166,42 +145,46 @@ class Folder(FolderToRead):
                 hint="stop it, or choose another directory",
             ) from None
 
-    def write(self, name: str, data: bytes) -> None:
-        """Create a file."""
-        fd = self._open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
-        try:
-            left = memoryview(data)
-            while left:
-                left = left[os.write(fd, left) :]
-        finally:
-            os.close(fd)
+    def is_in_use(self) -> bool:
+        """Return False: only this process works with it."""
+        return False
+
+    def create(self, name: str) -> None:
+        """Create an empty file, for this user alone."""
+        os.close(os.open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600, dir_fd=self._fd))
 
     def sync(self, name: str) -> None:
         """Flush a file's content to the disk."""
-        fd = self._open(name, os.O_RDONLY)
-        try:
-            os.fdatasync(fd)
-        finally:
-            os.close(fd)
+        with open(os.open(name, _TO_READ, dir_fd=self._fd), "rb") as file:
+            os.fdatasync(file.fileno())
 
     def rename(self, old: str, new: str) -> None:
         """Rename a file, replacing any file that has the new name."""
         os.rename(old, new, src_dir_fd=self._fd, dst_dir_fd=self._fd)
 
     def remove(self, name: str) -> None:
-        """Remove a file."""
-        os.unlink(name, dir_fd=self._fd)
+        """Remove a file, if it is there."""
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(name, dir_fd=self._fd)
 
     def sync_names(self) -> None:
         """Flush all names to the disk."""
         os.fsync(self._fd)
+
+    def identity(self, name: str) -> tuple[int, int] | None:
+        """Return the device and the inode of a file; None if there is none of that name."""
+        with contextlib.suppress(FileNotFoundError):
+            status = os.stat(name, dir_fd=self._fd, follow_symlinks=False)
+            return status.st_dev, status.st_ino
+        return None
 
     def moved(self) -> str:
         """Return what happened to the directory if it is no longer at its path; else an empty string."""
         try:
             status = os.stat(self.path)
         except (FileNotFoundError, NotADirectoryError):
-            return "it was moved or removed"
+            return "its directory: it was moved or removed"
         except OSError as error:
-            return f"it cannot be looked at: {error.strerror}"
-        return "" if (status.st_dev, status.st_ino) == self._identity else "another one is in its place"
+            return f"its directory: it cannot be looked at: {error.strerror}"
+        is_there = (status.st_dev, status.st_ino) == self._identity
+        return "" if is_there else "its directory: another one is in its place"

@@ -14,10 +14,10 @@ from shmmap.errors import MapDataError
 from shmmap.formats.durable_file import flush_directory
 from shmmap.live_worker.disk.folder import Folder, FolderToRead, free_name
 from shmmap.live_worker.disk.map_record import MAP_FILE, Lost, MapRecord, Row, read_map
-from shmmap.live_worker.disk.old_directory import OldFiles
-from shmmap.live_worker.disk.rebuilding import Salvage, rebuild, salvage
+from shmmap.live_worker.disk.old_directory import old_files
+from shmmap.live_worker.disk.rebuilding import Salvage, asides, check_log, rebuild, salvage
 from shmmap.live_worker.disk.schema import DATABASE, LOG, SHARED, TABLES_DAMAGED, connect, database_errors
-from shmmap.live_worker.disk.stored_map import StoredMap, asides
+from shmmap.live_worker.disk.stored_map import StoredMap
 
 
 class LostChunk(msgspec.Struct, frozen=True):
@@ -126,7 +126,7 @@ def check(folder: FolderToRead, path: str) -> CheckedMap:
 
 def _salvaged(folder: FolderToRead, why: MapDataError) -> tuple[Salvage, MapRecord]:
     """Return what is left of a database, and the map's record: of that, or its copy."""
-    found = salvage(folder, None)
+    found = salvage(folder)
     record = found.record
     with contextlib.suppress(OSError, MapDataError):
         record = record or read_map(folder)
@@ -171,7 +171,7 @@ def files_of_map(folder: FolderToRead) -> dict[str, int]:
     own = (DATABASE + ".", f".{MAP_FILE}.", LOG, SHARED)
     others = sorted(name for name in names if name.startswith(own))
     last = [name for name in (MAP_FILE, DATABASE) if name in names]
-    return {name: folder.size(name) for name in [*OldFiles.of(names).all, *others, *last]}
+    return {name: folder.size(name) for name in [*old_files(names), *others, *last]}
 
 
 def reset(folder: Folder, *, delete: bool) -> ResetMap:
@@ -190,29 +190,21 @@ def reset(folder: Folder, *, delete: bool) -> ResetMap:
         A file cannot be moved or deleted.
     """
     if DATABASE in folder.names():
-        with (
-            contextlib.suppress(OSError, MapDataError),
-            database_errors(folder),
-            contextlib.closing(connect(folder)) as database,
-        ):
-            database.execute("pragma wal_checkpoint(truncate)").fetchall()  # without its log it is older
+        with contextlib.suppress(OSError, MapDataError), database_errors(folder):
+            check_log(folder)
+            with contextlib.closing(connect(folder)) as database:
+                database.execute("pragma wal_checkpoint(truncate)").fetchall()  # without its log it is older
     sizes = files_of_map(folder)
-    aside = ""
-    if not delete:
-        name = free_name(folder, "reset.")
-        aside = os.path.join(folder.path, name)
-        os.mkdir(aside, mode=0o700)
-    for name in sizes:
-        if delete:
-            folder.remove(name)
-        else:
-            folder.rename(name, os.path.join(os.path.basename(aside), name))
-        _sync(folder, aside)
-    _sync(folder, aside)
-    return ResetMap(folder.path, aside, len(sizes), sum(sizes.values()))
-
-
-def _sync(folder: Folder, aside: str) -> None:
+    aside = "" if delete else free_name(folder, "reset.")
     if aside:
-        flush_directory(aside)
-    folder.sync_names()
+        os.mkdir(folder.place(aside), mode=0o700)
+    for name in sizes:
+        if aside:
+            folder.rename(name, f"{aside}/{name}")
+            flush_directory(folder.place(aside))
+        else:
+            folder.remove(name)
+        folder.sync_names()
+    return ResetMap(
+        folder.path, os.path.join(folder.path, aside) if aside else "", len(sizes), sum(sizes.values())
+    )

@@ -31,7 +31,8 @@ from shmmap.chunks.chunk_file import decode_chunk, read_file_header
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.errors import ConfigError, MapDataError
 from shmmap.failpoints import step
-from shmmap.live_worker.disk.folder import INTERIM, Folder, named, replace_file
+from shmmap.formats.durable_file import appearing_file
+from shmmap.live_worker.disk.folder import INTERIM, Folder, named
 from shmmap.live_worker.disk.map_record import (
     MAP_FILE,
     MAP_FORMAT,
@@ -41,10 +42,17 @@ from shmmap.live_worker.disk.map_record import (
     MapRecord,
     MapSettings,
     Row,
+    boot_id,
     read_map,
 )
-from shmmap.live_worker.disk.old_directory import Chunks, OldFiles, put_old_files_aside, read_old_chunks
-from shmmap.live_worker.disk.rebuilding import finish_replacing, make_database, put_in_place, rebuild
+from shmmap.live_worker.disk.old_directory import Chunks, old_files, put_old_files_aside, read_old_chunks
+from shmmap.live_worker.disk.rebuilding import (
+    check_log,
+    finish_replacing,
+    make_database,
+    put_in_place,
+    rebuild,
+)
 from shmmap.live_worker.disk.schema import (
     DATABASE,
     GET_DATA,
@@ -130,6 +138,7 @@ class MapDatabase:
         self._writer: sqlite3.Connection | None = None
         self._reader: sqlite3.Connection | None = None
         self._log = -1
+        self._identities: dict[str, tuple[int, int] | None] = {}  # of the files that are open
         self._opened = 0  # times that a database was opened
         self._damage = ""
         self._is_closed = self._begun = self._flush_failed = False
@@ -172,7 +181,7 @@ class MapDatabase:
             _check_settings(record.settings, settings)
             log.info("live map of an earlier version is imported", path=folder.path)
             chunks = read_old_chunks(folder, record)
-        elif OldFiles.of(names).all:
+        elif old_files(names):
             raise MapDataError(
                 "there are chunks, or a list of them, but the file that says what they are is missing",
                 path=MAP_FILE,
@@ -192,17 +201,13 @@ class MapDatabase:
 
     def _open(self) -> None:
         """Open the database, and read the record and the rows; raise as `database_errors`."""
-        try:
-            self._connect()
-        except BaseException:
-            self._disconnect()  # else it would not be tried again
-            raise
-
-    def _connect(self) -> None:
-        with self._reading, database_errors(self.folder):
+        check_log(self.folder)
+        with self._reading, database_errors(self.folder), contextlib.ExitStack() as undo:
+            undo.callback(self._disconnect)  # else it would not be tried again
             self._writer = connect(self.folder)
             check_tables(self._writer)
             require_log(self._writer, self.folder)
+            _cut_log(self._writer)  # nothing is written behind what was dropped from it
             for pragma in ("synchronous = normal", "wal_autocheckpoint = 0", "cell_size_check = on"):
                 self._writer.execute(f"pragma {pragma}")
             text = self._writer.execute("select record from map").fetchall()
@@ -211,9 +216,11 @@ class MapDatabase:
             if not self._has_record:
                 self.record, self._has_record = read_record(self._reader), True
             rows, numbers, last = read_rows(self._reader, self.record)
-        self._log = os.open(self.folder.place(LOG), os.O_RDONLY | os.O_CLOEXEC)
-        os.fdatasync(self._log)
-        self.folder.sync_names()
+            self._log = os.open(self.folder.place(LOG), os.O_RDONLY | os.O_CLOEXEC)
+            os.fdatasync(self._log)
+            self.folder.sync_names()
+            self._identities = {name: self.folder.identity(name) for name in (DATABASE, LOG)}
+            undo.pop_all()
         with self._changing:
             self.rows, self._numbers, self._next_number = rows, numbers, last + 1
             self.lost = self.record.lost_chunks
@@ -227,7 +234,7 @@ class MapDatabase:
                         connection.close()
             if self._log >= 0:
                 os.close(self._log)
-            self._reader, self._writer, self._log = None, None, -1
+            self._reader, self._writer, self._log, self._identities = None, None, -1, {}
 
     def _rebuild(self, reason: str) -> None:
         """Make a database from what is left of this one; the thread holds `_writing`."""
@@ -287,6 +294,7 @@ class MapDatabase:
         """Return the number of runs of the map, this one included; on disk when this returns."""
         if not self._begun:
             self.record.runs += 1
+            self.record.boot = boot_id()
             self._write_map()
             self._begun = True
         return self.record.runs
@@ -295,30 +303,28 @@ class MapDatabase:
         """Add a mapper with a new number, which is on disk when this returns."""
         mapper = Mapper(self.record.next_mapper, uid, name)
         self.record.next_mapper += 1
-        self._write_mappers([*self.mappers, mapper])
+        self._write_change(self.record, "mappers", [*self.mappers, mapper])
         return mapper
 
     def forget_mapper(self, mapper: Mapper) -> None:
         """Forget a mapper; its number is not used again."""
-        self._write_mappers([one for one in self.mappers if one.number != mapper.number])
-
-    def _write_mappers(self, mappers: list[Mapper]) -> None:
-        before, self.record.mappers = self.record.mappers, mappers
-        try:
-            self._write_map()
-        except OSError:
-            self.record.mappers = before
-            raise
+        left = [one for one in self.mappers if one.number != mapper.number]
+        self._write_change(self.record, "mappers", left)
 
     def expect_scan(self, mapper: Mapper, scan: int) -> None:
         """Record on disk that a mapper's scans may have reached this number."""
-        if scan >= (before := mapper.scans):
-            mapper.scans = scan + SCANS_AHEAD
-            try:
-                self._write_map()
-            except OSError:
-                mapper.scans = before
-                raise
+        if scan >= mapper.scans:
+            self._write_change(mapper, "scans", scan + SCANS_AHEAD)
+
+    def _write_change(self, changed: MapRecord | Mapper, name: str, value: object) -> None:
+        """Change a part of the record, on disk; it stays as it was if that fails."""
+        before = getattr(changed, name)
+        setattr(changed, name, value)
+        try:
+            self._write_map()
+        except OSError:
+            setattr(changed, name, before)
+            raise
 
     def write_record(self, applied: dict[int, int] | None = None) -> None:
         """Write the record, and make all saved chunks durable.
@@ -344,8 +350,9 @@ class MapDatabase:
             try:
                 text = self._change(put)
                 self.flush()
-                replace_file(self.folder, MAP_FILE, msgspec.json.format(text, indent=1) + b"\n")
-                self.folder.sync_names()
+                with appearing_file(self.folder.place(MAP_FILE)) as file:
+                    os.fchmod(file.fileno(), 0o600)
+                    file.write(msgspec.json.format(text, indent=1) + b"\n")
             except OSError:
                 self.record_is_due = True
                 raise
@@ -415,6 +422,14 @@ class MapDatabase:
         for key in list(self.unreadable)[:_LOOKED_AT]:
             with contextlib.suppress(OSError):
                 self.load(key)
+
+    def moved(self) -> str:
+        """Return what happened to the directory, or to a file of the database, if it is not where it was."""
+        with self._writing:
+            for name, identity in self._identities.items():
+                if self.folder.identity(name) != identity:
+                    return f"{name}: it was moved, removed or replaced"
+        return self.folder.moved()
 
     def _lose(self, key: ChunkKey, row: Row, why: str) -> None:
         """Note, on disk, that the saved bytes of a chunk, which had this row, are of no use."""
@@ -545,9 +560,7 @@ class MapDatabase:
         def bring(writer: sqlite3.Connection) -> None:
             writer.execute("pragma wal_checkpoint(passive)").fetchall()  # most of the work, beside reads
             with self._reading:
-                (busy, _, _) = writer.execute("pragma wal_checkpoint(truncate)").fetchone()
-            if busy:
-                raise BlockingIOError(errno.EAGAIN, "another process keeps reading its database")
+                _cut_log(writer)
 
         with self._writing:
             self._change(bring)
@@ -555,6 +568,13 @@ class MapDatabase:
     def finish(self) -> None:
         """Bring the log into the database, at the end."""
         self._bring_log_in()
+
+
+def _cut_log(writer: sqlite3.Connection) -> None:
+    """Write what the log has into the database, and make the log empty."""
+    (busy, _, _) = writer.execute("pragma wal_checkpoint(truncate)").fetchone()
+    if busy:
+        raise BlockingIOError(errno.EAGAIN, "another process keeps reading its database")
 
 
 def _copy_of_record(folder: Folder) -> MapRecord | None:

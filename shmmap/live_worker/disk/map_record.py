@@ -7,8 +7,7 @@ It is a row of the database; ``map.json`` is a copy, in case the database is dam
 
 from __future__ import annotations
 
-import re
-import struct
+from pathlib import Path
 from typing import Annotated, Final, TypeAlias, TypeVar
 
 import msgspec
@@ -26,17 +25,14 @@ MAP_FILE: Final = "map.json"
 MAP_FORMAT: Final = 2
 OLD_FORMAT: Final = 1
 """Of a directory in which each chunk is a file: until 0.3."""
-_MAX_MAP_BYTES: Final = 1 << 26
-_MAP_ID: Final = re.compile(r"[0-9a-f]{32}")
-_RESOLUTION_M: Final = (1e-4, 1e3)
 _NOT_DECODED: Final = (
     msgspec.MsgspecError,
     ValueError,
+    BadRequest,
     ConfigError,
     RecursionError,
     MemoryError,
     OverflowError,
-    struct.error,
 )
 """Exceptions that decoders raise for damaged bytes."""
 
@@ -57,9 +53,13 @@ class MapSettings(msgspec.Struct, frozen=True):
         Frame of the map.
     """
 
-    resolution: float = 0.05
+    resolution: Annotated[float, msgspec.Meta(ge=1e-4, le=1e3)] = 0.05
     occupancy: Occupancy = Occupancy()
     frame_id: str = "map"
+
+    def __post_init__(self) -> None:
+        if not 0 < len(self.frame_id.encode()) <= MAX_FRAME_BYTES:
+            raise ValueError("frame_id is empty or too long")
 
     def identity(self, map_id: bytes, key: ChunkKey, generation: int) -> ChunkIdentity:
         """Return the identity of a chunk in memory, of a map with these settings."""
@@ -137,22 +137,38 @@ class MapRecord(msgspec.Struct):
         Chunks that lost something, by key, until that is forgotten on purpose.
     damaged
         Numbers of damaged rows, which stay as they are and do not count.
+    boot
+        Since which start of the machine the database's log is written: only the end of that loses what was
+        not flushed.
     """
 
     format: int
-    map_id: str
+    map_id: Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{32}$")]
     settings: MapSettings
-    mappers: list[Mapper] = []
+    mappers: Annotated[list[Mapper], msgspec.Meta(max_length=MAPPERS)] = []
     next_mapper: Annotated[int, msgspec.Meta(ge=1, le=1 << 53)] = 1
     runs: Annotated[int, msgspec.Meta(ge=0, lt=(1 << 31) - 1)] = msgspec.field(default=0, name="lives")
     applied: dict[int, Count] = {}
     lost: dict[str, Lost] = {}
     damaged: list[Count] = []
+    boot: str = ""
+
+    def __post_init__(self) -> None:
+        numbers = {one.number for one in self.mappers}
+        if len(numbers) < len(self.mappers) or max(numbers, default=0) >= self.next_mapper:
+            raise ValueError("two mappers have one number, or one has a number that was not given yet")
+        for text in self.lost:
+            ChunkKey.from_text(text)
 
     @property
     def lost_chunks(self) -> dict[ChunkKey, Lost]:
         """The lost chunks by their keys."""
         return {ChunkKey.from_text(text): one for text, one in self.lost.items()}
+
+
+def boot_id() -> str:
+    """Return the id of this start of the machine."""
+    return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
 
 
 # created once, here: msgspec crashes if several threads decode a type for the first time concurrently
@@ -178,8 +194,7 @@ def read_map(folder: FolderToRead) -> MapRecord:
     OSError
         It cannot be read.
     """
-    data = whole_file(folder, MAP_FILE, _MAX_MAP_BYTES)
-    return decode_map(data, MAP_FILE, formats=(OLD_FORMAT, MAP_FORMAT))
+    return decode_map(folder.read(MAP_FILE), MAP_FILE, formats=(OLD_FORMAT, MAP_FORMAT))
 
 
 def decode_map(data: bytes | str, path: str, *, formats: tuple[int, ...] = (MAP_FORMAT,)) -> MapRecord:
@@ -187,33 +202,4 @@ def decode_map(data: bytes | str, path: str, *, formats: tuple[int, ...] = (MAP_
     found = decoded(data, _map_record, path)
     if found.format not in formats:
         raise MapDataError(f"format {found.format}; this reads {MAP_FORMAT}", path=path)
-    numbers = [one.number for one in found.mappers]
-    least, most = _RESOLUTION_M
-    for is_right, what in (
-        (_MAP_ID.fullmatch(found.map_id), "map_id is not 32 hexadecimal digits"),
-        (least <= found.settings.resolution <= most, f"resolution {found.settings.resolution!r}"),
-        (0 < len(found.settings.frame_id.encode()) <= MAX_FRAME_BYTES, "frame_id is empty or too long"),
-        (len(numbers) <= MAPPERS, f"{len(numbers)} mappers; {MAPPERS} are the most"),
-        (len(set(numbers)) == len(numbers), "two mappers have one number"),
-        (all(map(_is_key, found.lost)), "a lost chunk has no key"),
-        (max(numbers, default=0) < found.next_mapper, "a mapper has a number that was not given yet"),
-    ):
-        if not is_right:
-            raise MapDataError(f"it is damaged: {what}", path=path)
     return found
-
-
-def _is_key(text: str) -> bool:
-    try:
-        ChunkKey.from_text(text)
-    except BadRequest:
-        return False
-    return True
-
-
-def whole_file(folder: FolderToRead, name: str, most: int) -> bytes:
-    """Return a whole file of at most ``most`` bytes; raise as `read_map`."""
-    data = folder.read(name, most + 1)
-    if len(data) > most:
-        raise MapDataError(f"it has more than {most:,} bytes", path=name, cause="too_long")
-    return data

@@ -12,16 +12,17 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 from collections.abc import Iterable, Iterator
-from typing import Final, NamedTuple
+from itertools import count
+from typing import Final
 
 import msgspec
 
 from shmmap.chunks.chunk_file import FILE_HEADER_BYTES, check_file, read_file_header
-from shmmap.chunks.layout import MAX_BYTES as MAX_CHUNK_BYTES
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.errors import BadRequest, MapDataError
-from shmmap.live_worker.disk.folder import DAMAGED, INTERIM, MAX_BYTES, Folder, FolderToRead, free_name, named
+from shmmap.live_worker.disk.folder import Folder, FolderToRead, named
 from shmmap.live_worker.disk.map_record import (
     MAP_FILE,
     MAP_FORMAT,
@@ -32,7 +33,6 @@ from shmmap.live_worker.disk.map_record import (
     Row,
     decoded,
     read_map,
-    whole_file,
 )
 from shmmap.logfmt import log
 
@@ -40,8 +40,10 @@ MANIFEST: Final = "manifest.json"
 CHUNK: Final = ".chunk"
 IMPORTED: Final = "imported."
 """Directory, with a number, into which imported files are moved."""
-_MAX_CHUNK_FILE_BYTES: Final = 2 * MAX_CHUNK_BYTES
-"""Maximum length of a chunk's file: incompressible content becomes slightly longer."""
+_CHUNK_FILE: Final = re.compile(r".*\.chunk|(\..*)?\.chunk\..*\.tmp")
+_OTHER_FILE: Final = re.compile(
+    r"manifest\.json(\.damaged\..*)?|\.manifest\.json\..*\.tmp|.*\.chunk\.damaged\..*"
+)
 
 
 class _Manifest(msgspec.Struct):
@@ -56,36 +58,22 @@ class _Manifest(msgspec.Struct):
 _manifest: Final = msgspec.json.Decoder(_Manifest)
 
 
-class OldFiles(NamedTuple):
-    """The files of an old directory; ``chunks`` may be chunks, under whatever name."""
-
-    chunks: list[str]
-    others: list[str]
-
-    @classmethod
-    def of(cls, names: Iterable[str]) -> OldFiles:
-        """Find them among all names; ``map.json`` is not included."""
-        found = cls([], [])
-        for name in sorted(names):
-            is_interim = name.startswith(".") and name.endswith(INTERIM)
-            if name.endswith(CHUNK) or (is_interim and f"{CHUNK}." in name):
-                found.chunks.append(name)
-            elif (
-                name == MANIFEST
-                or (is_interim and name.startswith(f".{MANIFEST}."))
-                or f"{CHUNK}{DAMAGED}" in name
-                or name.startswith(f"{MANIFEST}{DAMAGED}")
-            ):
-                found.others.append(name)
-        return found
-
-    @property
-    def all(self) -> list[str]:
-        """All in the order in which they may be removed: the manifest, which would miss others, first."""
-        return sorted([*self.chunks, *self.others], key=lambda name: name != MANIFEST)
-
-
 Chunks = Iterator[tuple[ChunkKey, Row, bytes]]
+
+
+def old_chunks(names: Iterable[str]) -> list[str]:
+    """Return the files that may be chunks, under whatever name."""
+    return sorted(filter(_CHUNK_FILE.fullmatch, names))
+
+
+def old_files(names: Iterable[str]) -> list[str]:
+    """Return the files of an old directory but ``map.json``, in the order in which they may be removed.
+
+    The manifest, which would miss others, is the first.
+    """
+    names = list(names)
+    others = sorted(filter(_OTHER_FILE.fullmatch, names), key=lambda name: name != MANIFEST)
+    return [*others, *old_chunks(names)]
 
 
 def read_old_chunks(folder: FolderToRead, record: MapRecord) -> Chunks:
@@ -98,7 +86,7 @@ def read_old_chunks(folder: FolderToRead, record: MapRecord) -> Chunks:
     """
     candidates: dict[ChunkKey, list[tuple[int, str]]] = {}
     damaged: dict[str, str] = {}
-    for name in OldFiles.of(folder.names()).chunks:
+    for name in old_chunks(folder.names()):
         with named(name):
             try:
                 header = read_file_header(folder.read(name, FILE_HEADER_BYTES), name)
@@ -115,7 +103,7 @@ def read_old_chunks(folder: FolderToRead, record: MapRecord) -> Chunks:
     for key, names in candidates.items():
         for _, name in sorted(names, reverse=True):
             with named(name):
-                data = whole_file(folder, name, _MAX_CHUNK_FILE_BYTES)
+                data = folder.read(name)
             try:
                 rows[key] = Row.of(check_file(data, name))
             except MapDataError as error:
@@ -159,7 +147,7 @@ def _read_manifest(folder: FolderToRead) -> _Manifest:
         return nothing
     try:
         with named(MANIFEST):
-            found = decoded(whole_file(folder, MANIFEST, MAX_BYTES - 1), _manifest, MANIFEST)
+            found = decoded(folder.read(MANIFEST), _manifest, MANIFEST)
         for text in (*found.chunks, *found.missing):
             ChunkKey.from_text(text)
     except (MapDataError, BadRequest) as error:
@@ -174,12 +162,11 @@ def put_old_files_aside(folder: Folder) -> None:
     One that a kill interrupted is completed: ``map.json`` is moved last.
     """
     record = [MAP_FILE] if _is_old_record(folder) else []
-    names = [*OldFiles.of(folder.names()).all, *record]
+    names = [*old_files(folder.names()), *record]
     if not names:
         return
-    begun = [one for one in folder.names() if one.startswith(IMPORTED) and _takes(folder, one, names)]
-    aside = begun[0] if begun else free_name(folder, IMPORTED)
-    if not begun:
+    aside = next(one for number in count(1) if _takes(folder, one := f"{IMPORTED}{number}", names))
+    with contextlib.suppress(FileExistsError):
         os.mkdir(folder.place(aside), mode=0o700)
     for name in names:
         folder.rename(name, f"{aside}/{name}")
@@ -190,9 +177,11 @@ def put_old_files_aside(folder: Folder) -> None:
 
 
 def _takes(folder: FolderToRead, aside: str, names: list[str]) -> bool:
-    """Return whether this is a directory in which files may still be put: nothing is replaced there."""
+    """Return whether files may be put into a directory of this name: nothing is replaced there."""
     try:
         return not {MAP_FILE, *names}.intersection(os.listdir(folder.place(aside)))
+    except FileNotFoundError:
+        return True
     except NotADirectoryError:
         return False
 

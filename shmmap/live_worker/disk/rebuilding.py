@@ -8,30 +8,32 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterable, Iterator, Mapping
-from typing import Any, Final, NamedTuple
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import chain
+from typing import Final, NamedTuple
 
 import msgspec
 
-from shmmap.chunks.chunk_file import check_file
+from shmmap.chunks.chunk_file import ChunkFileHeader, check_file
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.errors import BadRequest, MapDataError
 from shmmap.failpoints import step
 from shmmap.live_worker.disk.folder import DAMAGED, Folder, FolderToRead, free_name
-from shmmap.live_worker.disk.map_record import Lost, MapRecord, Row, decode_map
-from shmmap.live_worker.disk.salvage import Pages, index_entries, table_rows
+from shmmap.live_worker.disk.map_record import Lost, MapRecord, Row, boot_id, decode_map, read_map
+from shmmap.live_worker.disk.salvage import Log, Pages, Values, index_entries, table_rows
 from shmmap.live_worker.disk.schema import (
     DATABASE,
     LOG,
     PUT_CHUNK,
     SHARED,
+    TABLES_DAMAGED,
     chunk_values,
     connect,
     database_errors,
     make_tables,
+    read_record,
     require_log,
 )
-from shmmap.live_worker.disk.stored_map import asides
 from shmmap.logfmt import log
 
 NEW: Final = "map.db.new"
@@ -57,7 +59,7 @@ def make_database(
     """
     remove_unfinished(folder)
     try:
-        folder.write(NEW, b"")  # for this user alone
+        folder.create(NEW)
         with database_errors(folder), contextlib.closing(connect(folder, NEW)) as database:
             make_tables(database)
             for number, (key, row, data) in enumerate(chunks, 1):
@@ -74,8 +76,7 @@ def make_database(
 def remove_unfinished(folder: Folder) -> None:
     """Remove a database that was not completed."""
     for name in (NEW, f"{NEW}-wal", f"{NEW}-shm", f"{NEW}-journal"):
-        with contextlib.suppress(FileNotFoundError):
-            folder.remove(name)
+        folder.remove(name)
 
 
 def put_in_place(folder: Folder) -> None:
@@ -94,9 +95,15 @@ def replace_database(folder: Folder, aside: str) -> None:
         with contextlib.suppress(FileNotFoundError):
             folder.rename(name, kept)
         folder.sync_names()
-    with contextlib.suppress(FileNotFoundError):
-        folder.remove(SHARED)
+    folder.remove(SHARED)
     put_in_place(folder)
+
+
+def asides(folder: FolderToRead) -> list[str]:
+    """Return the names of damaged databases that were put aside."""
+    start = DATABASE + DAMAGED
+    names = (name for name in folder.names() if name.startswith(start))
+    return sorted(name for name in names if name[len(start) :].isdecimal())
 
 
 def finish_replacing(folder: Folder) -> bool:
@@ -106,6 +113,68 @@ def finish_replacing(folder: Folder) -> bool:
         return False
     replace_database(folder, max(damaged, key=lambda name: os.stat(folder.place(name)).st_ctime_ns))
     return True
+
+
+# --- the log ------------------------------------------------------------------------------------
+
+
+def check_log(folder: FolderToRead) -> None:
+    """Check that SQLite would read the whole log of a database, and that this is its log.
+
+    Raises
+    ------
+    MapDataError
+        It would not (cause `TABLES_DAMAGED`).  Opening the database would then make that lasting.
+    """
+    _, reason = _checked_log(folder)
+    if reason:
+        raise MapDataError(reason, path=DATABASE, cause=TABLES_DAMAGED)
+
+
+def _checked_log(folder: FolderToRead) -> tuple[Log, str]:
+    """Return what counts of the log, and what is wrong with it."""
+    try:
+        found = Log(folder.read(LOG))
+    except FileNotFoundError:
+        return Log(b""), ""
+    if _is_foreign(folder, found):
+        return Log(b""), "its log is of another map"
+    # a daemon that runs has its own index of the frames, and goes on
+    if not folder.is_in_use() and found.is_damaged(was_cut=not _is_same_boot(folder)):
+        return found, "a page of its log is damaged"
+    return found, ""
+
+
+def _is_foreign(folder: FolderToRead, found: Log) -> bool:
+    """Return whether a log has rows of another map."""
+    for _, values in table_rows(Pages(None, found, found.count)):
+        if (record := _record_of(values)) is not None:
+            return _map_id(folder) not in ("", record.map_id)
+        if (chunk := _chunk_of(values)) is not None:
+            return _map_id(folder) not in ("", chunk[0].map_id.hex())
+    return False
+
+
+def _map_id(folder: FolderToRead) -> str:
+    """Return a map's id, as the database has it without its log, or the copy of its record."""
+    with (
+        contextlib.suppress(OSError, MapDataError),
+        database_errors(folder),
+        contextlib.closing(connect(folder, mode="ro&immutable=1")) as database,
+    ):
+        return read_record(database).map_id
+    with contextlib.suppress(OSError, MapDataError):
+        return read_map(folder).map_id
+    return ""
+
+
+def _is_same_boot(folder: FolderToRead) -> bool:
+    with contextlib.suppress(OSError, MapDataError):
+        return read_map(folder).boot == boot_id()
+    return False
+
+
+# --- what is left -------------------------------------------------------------------------------
 
 
 class Salvage(NamedTuple):
@@ -126,28 +195,29 @@ class Salvage(NamedTuple):
     record: MapRecord | None
 
 
-def salvage(folder: FolderToRead, map_id: bytes | None) -> Salvage:
-    """Read what is left; ``map_id`` is that of the chunks that count, None for all.
+def salvage(folder: FolderToRead, map_id: str = "") -> Salvage:
+    """Read what is left; ``map_id`` is that of the chunks that count, empty for all.
 
     No connection of this process may be open: closing a descriptor would drop its locks.
     """
-    with _opened(folder) as pages:
-        return _salvage(pages, map_id)
+    with _opened(folder) as versions:
+        return _salvage(versions, map_id)
 
 
-def _salvage(pages: Pages, map_id: bytes | None) -> Salvage:
+def _salvage(versions: Sequence[Pages], map_id: str) -> Salvage:
     rows: dict[ChunkKey, tuple[Row, int]] = {}
     names: dict[ChunkKey, int] = {}
     record = None
-    for number, values in table_rows(pages):
-        if (chunk := _good_chunk(values, map_id)) is not None:
-            key, row, _ = chunk
-            if key not in rows or (rows[key][1], rows[key][0].version) < (number, row.version):
+    for number, values in chain.from_iterable(map(table_rows, versions)):
+        if (chunk := _chunk_of(values)) is not None:
+            key, row = chunk[0].key, Row.of(chunk[0])
+            if map_id in ("", chunk[0].map_id.hex()) and (
+                key not in rows or (rows[key][1], rows[key][0].version) < (number, row.version)
+            ):
                 rows[key] = row, number
-        elif len(values) == _MAP_COLUMNS and isinstance(values[1], str):
-            with contextlib.suppress(MapDataError):
-                record = decode_map(values[1], DATABASE)
-    for entry in index_entries(pages):
+        else:
+            record = _record_of(values) or record
+    for entry in chain.from_iterable(map(index_entries, versions)):
         with contextlib.suppress(BadRequest, ValueError, TypeError, AttributeError):
             text, version, _ = entry
             key = ChunkKey.from_text(text)
@@ -176,8 +246,8 @@ def rebuild(
     OSError
         The disk is full, or fails: the damaged database is as it was.
     """
-    with _opened(folder) as pages:
-        found = _salvage(pages, bytes.fromhex(record.map_id) if record is not None else None)
+    with _opened(folder) as versions:
+        found = _salvage(versions, record.map_id if record is not None else "")
         record = record or found.record
         if record is None:
             raise MapDataError(f"{reason}; so is the copy of its record", path=DATABASE)
@@ -187,7 +257,7 @@ def rebuild(
                 lost[key] = Lost(version, reason)
         record.lost = {key.text: one for key, one in lost.items()}
         record.damaged = []
-        make_database(folder, record, _chunks(pages, found))
+        make_database(folder, record, _chunks(versions, found))
     aside = free_name(folder, DATABASE + DAMAGED)
     replace_database(folder, aside)
     log.error(
@@ -196,33 +266,42 @@ def rebuild(
     return record, aside
 
 
-def _chunks(pages: Pages, found: Salvage) -> Iterator[tuple[ChunkKey, Row, bytes]]:
+def _chunks(versions: Sequence[Pages], found: Salvage) -> Iterator[tuple[ChunkKey, Row, bytes]]:
     """Yield the chunks that were found, each once."""
     left = dict(found.rows)
-    for number, values in table_rows(pages):
-        if (chunk := _good_chunk(values, None)) is not None and left.get(chunk[0]) == (chunk[1], number):
-            del left[chunk[0]]
-            yield chunk
+    for number, values in chain.from_iterable(map(table_rows, versions)):
+        if (chunk := _chunk_of(values)) is not None:
+            header, data = chunk
+            row = Row.of(header)
+            if left.get(header.key) == (row, number):
+                del left[header.key]
+                yield header.key, row, data
 
 
-def _good_chunk(values: list[Any], map_id: bytes | None) -> tuple[ChunkKey, Row, bytes] | None:
-    """Return the key, the row and the bytes of a chunk, if these values are one's and it is whole."""
-    if len(values) != _CHUNK_COLUMNS or not isinstance(data := values[-1], bytes):
-        return None
-    try:
-        header = check_file(data)
-    except MapDataError:
-        return None
-    return (header.key, Row.of(header), data) if map_id in (None, header.map_id) else None
+def _chunk_of(values: Values) -> tuple[ChunkFileHeader, bytes] | None:
+    """Return the header and the bytes of a chunk, if these values are one's and it is whole."""
+    if len(values) == _CHUNK_COLUMNS and isinstance(data := values[-1], bytes):
+        with contextlib.suppress(MapDataError):
+            return check_file(data), data
+    return None
+
+
+def _record_of(values: Values) -> MapRecord | None:
+    """Return a map's record, if these values are one and it is whole."""
+    if len(values) == _MAP_COLUMNS and isinstance(values[1], str):
+        with contextlib.suppress(MapDataError):
+            return decode_map(values[1], DATABASE)
+    return None
 
 
 @contextlib.contextmanager
-def _opened(folder: FolderToRead) -> Iterator[Pages]:
-    with contextlib.ExitStack() as closing:
-        descriptors = []
-        for name in (DATABASE, LOG):
-            folder.require_regular(name)
-            with contextlib.suppress(FileNotFoundError):
-                descriptors.append(os.open(folder.place(name), os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW))
-                closing.callback(os.close, descriptors[-1])
-        yield Pages(descriptors[0], descriptors[1] if len(descriptors) > 1 else None)
+def _opened(folder: FolderToRead) -> Iterator[list[Pages]]:
+    """Open a database as SQLite reads it; and with all of its log, where SQLite would drop a part of that."""
+    folder.require_regular(DATABASE)
+    found, reason = _checked_log(folder)
+    frames = [found.read, found.count] if reason else [found.read]
+    fd = os.open(folder.place(DATABASE), os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+    try:
+        yield [Pages(fd, found, number) for number in frames]
+    finally:
+        os.close(fd)

@@ -9,10 +9,13 @@ has it.
 
 from __future__ import annotations
 
+import contextlib
 import os
-import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any, Final, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
 
 from shmmap.live_worker.disk.schema import PAGE_BYTES, local_bytes
 
@@ -25,75 +28,122 @@ _FIRST_PAGE: Final = 100
 """Length of the file's header, on page 1."""
 _MAX_ROW_BYTES: Final = 1 << 28
 _INTEGERS: Final = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8}
-_LOG_HEADER: Final = struct.Struct(">8I")
-_FRAME: Final = struct.Struct(">6I")
-_NOT_A_ROW: Final = (IndexError, ValueError, KeyError, struct.error)
+_LOG_HEADER: Final = 32
+_LOG_MAGIC: Final = 0x377F0683
+"""First number of a log, apart from the order of bytes in checksums."""
+_FRAME_HEADER: Final = 24
+_FRAME: Final = _FRAME_HEADER + PAGE_BYTES
+_NOT_A_ROW: Final = (IndexError, ValueError, KeyError)
+
+
+class Log:
+    """The log of a database: each of its frames is a page as a transaction left it.
+
+    A frame's checksum continues that of the one before.  SQLite reads up to the first frame that is not
+    right, and drops whatever was committed after it.
+
+    Attributes
+    ----------
+    count
+        Number of frames.
+    read
+        Number of frames that SQLite reads.
+    """
+
+    def __init__(self, data: bytes) -> None:
+        self._data = data = data.ljust(_LOG_HEADER, b"\0")
+        header = np.frombuffer(data, np.uint32, _LOG_HEADER // 4)[np.newaxis]
+        first = header.view(">u4")
+        is_right = (_checksums(header[:, :6], np.zeros_like(header)) == first[:, 6:]).all()
+        has_header = bool(is_right and first[0, 0] | 1 == _LOG_MAGIC)
+        self.count = (len(data) - _LOG_HEADER) // _FRAME
+        if self.count == 1 and not has_header:
+            self.count = 0  # both are on one page
+        words = np.frombuffer(data, np.uint32, self.count * _FRAME // 4, _LOG_HEADER)
+        frames = words.reshape(self.count, _FRAME // 4)
+        fields = frames[:, : _FRAME_HEADER // 4].view(">u4")
+        self._numbers, pages, salts, sums = fields[:, 0], fields[:, 1], fields[:, 2:4], fields[:, 4:6]
+        before = np.concatenate([first[:, 6:], sums])[: self.count]
+        is_right = (_checksums(np.delete(frames, slice(2, 6), axis=1), before) == sums).all(axis=1)
+        is_current = (salts == (first[:, 4:6] if has_header else salts[1:2])).all(axis=1)
+        is_good = is_right & is_current
+        follows_good = np.concatenate([[has_header], is_good])[: self.count]
+        # whether a frame after a damaged one is right cannot be seen
+        self._is_usable = (self._numbers > 0) & is_current & (is_good | ~follows_good)
+        self._good = int(np.argmin([*(is_good & has_header), False]))
+        commits = np.flatnonzero(is_good & (pages > 0)) + 1
+        self.read = int(commits[commits <= self._good].max(initial=0))
+        self._committed = int(commits.max(initial=0))
+
+    def is_damaged(self, *, was_cut: bool) -> bool:
+        """Return whether a frame is not as it was written.
+
+        Parameters
+        ----------
+        was_cut
+            Whether the power may have been cut since: then pages are missing that had not been flushed.
+        """
+        if not was_cut:
+            return self._good < self.count
+        return self.read < self._committed and not self._is_unwritten
+
+    @property
+    def _is_unwritten(self) -> bool:
+        """Whether the first frame that is not right is on a page that the disk never got: it is zeros."""
+        begin = _LOG_HEADER + self._good * _FRAME
+        pages = range(begin - begin % PAGE_BYTES, begin + _FRAME, PAGE_BYTES)
+        return any(not any(self._data[max(begin, page) : page + PAGE_BYTES]) for page in pages)
+
+    def newest(self, frames: int) -> dict[int, int]:
+        """Return where in these first frames the newest version of each page is."""
+        usable = np.flatnonzero(self._is_usable[:frames])
+        return dict(zip(self._numbers[usable].tolist(), usable.tolist(), strict=True))
+
+    def page(self, frame: int) -> bytes:
+        """Return the page in a frame."""
+        begin = _LOG_HEADER + frame * _FRAME + _FRAME_HEADER
+        return self._data[begin : begin + PAGE_BYTES]
+
+
+def _checksums(words: NDArray[np.uint32], before: NDArray[np.uint32]) -> NDArray[np.uint32]:
+    """Return the checksum of each row of words, which continues the two numbers in its row of ``before``."""
+    first, second = before[:, 0].astype(np.uint32), before[:, 1].astype(np.uint32)
+    for at in range(0, words.shape[1], 2):
+        first = first + words[:, at] + second
+        second = second + words[:, at + 1] + first
+    return np.stack([first, second], axis=1)
 
 
 class Pages:
-    """The pages of a database as of the last commit in its log; a page that cannot be read is empty.
+    """The pages of a database, and of the first frames of its log; a page that cannot be read is empty.
 
     Parameters
     ----------
-    database, log
-        Descriptors of the file and of its log; None without a log.
+    database
+        Descriptor of the file; None for the pages that are in the log.
     """
 
-    def __init__(self, database: int, log: int | None) -> None:
+    def __init__(self, database: int | None, log: Log, frames: int) -> None:
         self._database, self._log = database, log
-        self._in_log = _committed(log) if log is not None else {}
-        self.count = max(os.fstat(database).st_size // PAGE_BYTES, *self._in_log, 0)
+        self._in_log = log.newest(frames)
+        self.numbers: Iterable[int] = self._in_log
+        self._count = max(self._in_log, default=0)
+        if database is not None:
+            self._count = os.fstat(database).st_size // PAGE_BYTES + log.count
+            self.numbers = range(1, self._count + 1)
 
     def __getitem__(self, number: int) -> bytes:
         """Return a page; the first has number 1."""
-        if not 0 < number <= self.count:
+        if not 0 < number <= self._count:
             raise ValueError(number)
-        place = self._in_log.get(number)
-        if place is not None and self._log is not None:
-            return _read(self._log, PAGE_BYTES, place)
-        return _read(self._database, PAGE_BYTES, (number - 1) * PAGE_BYTES).ljust(PAGE_BYTES, b"\0")
-
-
-def _read(fd: int, nbytes: int, place: int) -> bytes:
-    try:
-        return os.pread(fd, nbytes, place)
-    except OSError:
-        return b""
-
-
-def _committed(log: int) -> dict[int, int]:
-    """Return where in a log the newest committed version of each page is."""
-    found: dict[int, int] = {}
-    header = _read(log, _LOG_HEADER.size, 0)
-    if len(header) < _LOG_HEADER.size:
-        return found
-    magic, _, page_bytes, _, *salts, first, second = _LOG_HEADER.unpack(header)
-    words = struct.Struct("<2I" if magic & 1 == 0 else ">2I")
-    if magic >> 1 != 0x377F0682 >> 1 or page_bytes != PAGE_BYTES:
-        return found
-    if (sums := _checksum(words, header[:24], (0, 0))) != (first, second):
-        return found
-    uncommitted: dict[int, int] = {}
-    place = _LOG_HEADER.size
-    while len(frame := _read(log, _FRAME.size + PAGE_BYTES, place)) == _FRAME.size + PAGE_BYTES:
-        number, pages, *rest = _FRAME.unpack_from(frame)
-        sums = _checksum(words, frame[_FRAME.size :], _checksum(words, frame[:8], sums))
-        if rest != [*salts, *sums]:
-            break
-        uncommitted[number] = place + _FRAME.size
-        place += len(frame)
-        if pages:  # a commit
-            found.update(uncommitted)
-            uncommitted = {}
-    return found
-
-
-def _checksum(words: struct.Struct, data: bytes, sums: tuple[int, int]) -> tuple[int, int]:
-    first, second = sums
-    for one, other in words.iter_unpack(data):
-        first = (first + one + second) & 0xFFFFFFFF
-        second = (second + other + first) & 0xFFFFFFFF
-    return first, second
+        frame = self._in_log.get(number)
+        if frame is not None:
+            return self._log.page(frame)
+        found = b""
+        if self._database is not None:
+            with contextlib.suppress(OSError):
+                found = os.pread(self._database, PAGE_BYTES, (number - 1) * PAGE_BYTES)
+        return found.ljust(PAGE_BYTES, b"\0")
 
 
 def table_rows(pages: Pages) -> Iterator[tuple[int, Values]]:
@@ -119,7 +169,7 @@ def index_entries(pages: Pages) -> Iterator[Values]:
 
 def _cells(pages: Pages, kinds: dict[int, int]) -> Iterator[tuple[bytes, int]]:
     """Yield pages of these kinds with the place of each cell on them, after what precedes it."""
-    for number in range(1, pages.count + 1):
+    for number in pages.numbers:
         page = pages[number]
         start = _FIRST_PAGE if number == 1 else 0
         skipped = kinds.get(page[start])

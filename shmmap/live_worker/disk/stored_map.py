@@ -16,9 +16,10 @@ from shmmap.chunks.chunk_file import decode_chunk
 from shmmap.chunks.layout import ChunkView
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.errors import InstanceBusy, MapDataError, MapMissing
-from shmmap.live_worker.disk.folder import DAMAGED, Folder, FolderToRead
+from shmmap.live_worker.disk.folder import Folder, FolderToRead
 from shmmap.live_worker.disk.map_record import MAP_FILE
-from shmmap.live_worker.disk.old_directory import OldFiles
+from shmmap.live_worker.disk.old_directory import old_chunks, old_files
+from shmmap.live_worker.disk.rebuilding import check_log
 from shmmap.live_worker.disk.schema import (
     DATABASE,
     GET_DATA,
@@ -49,8 +50,6 @@ class StoredMap:
         As in the map's record.
     rows, lost
         As in `MapDatabase`.
-    aside
-        Damaged databases that were put aside before.
 
     Raises
     ------
@@ -61,7 +60,6 @@ class StoredMap:
     def __init__(self, folder: FolderToRead, path: str) -> None:
         self.folder = folder
         self.path = path
-        self.aside = asides(folder)
         self._open()
 
     def _open(self) -> None:
@@ -69,6 +67,7 @@ class StoredMap:
         self._is_alone = LOG not in self.folder.names()
         with self._reading(self.path):
             require_own_files(self.folder)
+            check_log(self.folder)
             mode = "ro&immutable=1" if self._is_alone else "ro"
             self._database: sqlite3.Connection = connect(self.folder, mode=mode)
             check_tables(self._database)
@@ -128,13 +127,6 @@ class StoredMap:
         self._database.close()
 
 
-def asides(folder: FolderToRead) -> list[str]:
-    """Return the names of damaged databases that were put aside."""
-    start = DATABASE + DAMAGED
-    names = (name for name in folder.names() if name.startswith(start))
-    return sorted(name for name in names if name[len(start) :].isdecimal())
-
-
 @contextlib.contextmanager
 def opened_folder_to_read(path: str) -> Iterator[FolderToRead]:
     """Open the directory of a live map, which other processes may be changing.
@@ -188,7 +180,7 @@ def require_database(folder: FolderToRead) -> None:
     names = folder.names()
     if DATABASE in names:
         return
-    if OldFiles.of(names).all:
+    if old_files(names):
         raise MapDataError(
             "it is a live map of an earlier version, with a file for each chunk",
             path=folder.path,
@@ -211,7 +203,7 @@ def _opened(path: str) -> FolderToRead:
             f"cannot open {path}: {error.strerror}", hint="the user whom the daemon runs as may, and root"
         ) from error
     names = folder.names()
-    if DATABASE in names or MAP_FILE in names or OldFiles.of(names).chunks:
+    if DATABASE in names or MAP_FILE in names or old_chunks(names):
         return folder
     folder.close()
     raise MapMissing(f"{path} is no live map: it has no {DATABASE}", hint="name the directory of a live map")

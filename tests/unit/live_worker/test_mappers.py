@@ -160,7 +160,7 @@ def test_a_mapper_goes_on_while_the_disk_is_full(
     active = mappers.open(1000, "front", 1)
     number = active.mapper.number
     with monkeypatch.context() as patch:
-        patch.setattr(Folder, "write", failing(errno.ENOSPC))
+        patch.setattr("os.fsync", failing(errno.ENOSPC))
         for scan in range(1, 3000):
             mappers.expect(number, scan, 1)
         for _ in range(2):
@@ -182,7 +182,7 @@ def test_a_mapper_that_cannot_be_forgotten_stays(
     for number in range(MAPPERS):
         mappers.open(1000, f"m{number}", 0)
     with monkeypatch.context() as patch:
-        patch.setattr(Folder, "write", failing(errno.EIO))
+        patch.setattr("os.fsync", failing(errno.EIO))
         for _ in range(2):
             with pytest.raises(OSError, match="Input/output"):
                 mappers.open(1000, "new", 1)
