@@ -29,7 +29,6 @@ from shmmap.daemon.cache.eviction_plan import (
 from shmmap.daemon.cache.reclaimer import Reclaimer
 from shmmap.daemon.records import Resident
 from shmmap.daemon.travel.places import NOWHERE, WORK_S, Places, until_needed
-from shmmap.large_tables import ShardedDict
 
 PREFETCHED_PER_TURN: Final = 64
 """Prefetched segments compared with a wish at a time: a tenth of a millisecond."""
@@ -187,15 +186,20 @@ class Evictor:
     def run_step(self, now_s: float) -> None:
         """Make a part of the next plan; once it is made, it takes the place of the present one."""
         self._stepped_s = now_s
-        ledger = self.reclaimer.ledger
         if self._making is None:
-            ledger.evictable.new = ShardedDict()
             self._next = EvictionPlan(*self._positions(now_s), now_s)
-            self._making = self._next.make(ledger.segments.walk(), lambda one: self._may_go(one, now_s))
+            self._making = self._next.make(self._all(), lambda one: self._may_go(one, now_s))
         before = self._next.work
         if next(self._making, self) is self:
             self._plan, self._making = self._next, None
         self._rests_until_s = now_s + WORK_S * (self._next.work - before)
+
+    def _all(self) -> Iterator[Resident]:
+        """Yield all segments; those that are yielded are not new any more."""
+        ledger = self.reclaimer.ledger
+        for resident in ledger.segments.walk():
+            ledger.evictable.new.pop(resident, None)
+            yield resident
 
     def _positions(self, now_s: float) -> tuple[Places, int]:
         """Return positions of clients and their version, at most `PLACES_S` old."""

@@ -36,6 +36,7 @@ from shmmap.daemon.travel.motion import Motion
 from shmmap.daemon.travel.places import WORK_S
 from shmmap.geometry import Area, Circle
 from shmmap.origin.catalogue import Catalogue
+from shmmap.origin.spatial_index import touches
 from shmmap.protocol.messages import Intent
 from shmmap.segment.layout import SourceStamp
 
@@ -483,7 +484,7 @@ class Work:
 
     def __init__(self, daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
         self.done = 0
-        count, query, is_absent, touches = self, Catalogue.query, daemon.is_absent, look_ahead.touches
+        count, query, is_absent = self, Catalogue.query, daemon.is_absent
 
         class Counted(Catalogue):
             def query(self, *arguments, **named):  # type: ignore[no-untyped-def]
