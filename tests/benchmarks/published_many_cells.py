@@ -2,6 +2,7 @@
 """A published map of ten million cells over 20 Mbit/s and 50 ms: ready, the cells nearby known, memory.
 
     python -m tests.benchmarks.published_many_cells [--cells 10000000] [--repeats 7] [--lift]
+    python -m tests.benchmarks.published_many_cells --window [--cells 1000000] [--repeats 7] [--lift]
 
 The map is that of `tests.support.made_map`: its list of cells has the size of a recorded map's, and each part
 of it is made when it is asked for (a root of ten million cells takes a minute or two before the first round).
@@ -15,24 +16,39 @@ of a place where four parts of the list meet; and the daemon's memory then, with
 runs on without a client, it fetches no more of the list: what it has after a minute is printed, too.
 
 Limits: ready at most 0.6 s after the local one, cells known in 0.6 s, 100 MB; the least of the rounds.
+
+With ``--window``, in turns: from when a daemon that never saw the map is ready until a client has all cells
+within 60 m of that place; and nothing but gets of the same parts of the list, then of the same objects, over
+the same link, in as many threads.  Printed are what was sent for either, too.  Limit: 1.03, least over least.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import sys
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor
+from hashlib import sha256
 from pathlib import Path
 from typing import Final
 
+import obstore
+from obstore.store import HTTPStore
+
 import shmmap
+from shmmap.daemon.loading.published_reader import CONCURRENT_FETCHES
+from shmmap.origin.remote.published_index import pack_shard
+from shmmap.origin.remote.published_object import POINTS as POINTS_LAYER
+from shmmap.origin.remote.published_object import blob_path
+from shmmap.origin.remote.zstd_frame import pack_frame
 from tests.benchmarks.hostile.stage import lift
 from tests.benchmarks.make_many_cells import make_many_cells
 from tests.benchmarks.many_cells import seconds_to_start
 from tests.support.daemon_process import DaemonProcess
-from tests.support.made_map import CELL_M, SHARD_M, ServedMadeMap, serve_made_map
+from tests.support.made_map import CELL_M, SHARD_M, MadeMap, ServedMadeMap, serve_made_map
 from tests.support.process_costs import processor_s, resident_bytes
 from tests.support.slow_link import Plan, SlowLink, slow_link
 
@@ -43,6 +59,8 @@ LOCAL_SIDE: Final = 100
 POINTS: Final = 40_000
 ASK_S: Final = 0.005
 LATER_S: Final = 60.0
+WINDOW_M: Final = 60.0
+WINDOW_LIMIT: Final = 1.03
 LIMITS: Final = {"ready": 0.6, "known": 0.6, "memory": 100.0}
 """Seconds after the local one, seconds, megabytes."""
 
@@ -80,18 +98,79 @@ def start_published(served: ServedMadeMap, link: SlowLink, *, later: bool, lifte
     return found
 
 
+def get_all(endpoint: str, paths: list[str]) -> None:
+    """Get objects, nothing else."""
+    store = HTTPStore.from_url(endpoint, client_options={"allow_http": True})
+    with ThreadPoolExecutor(CONCURRENT_FETCHES) as pool:
+        list(pool.map(lambda path: obstore.get(store, path).bytes(), paths))
+
+
+def objects_of(made: MadeMap, area: shmmap.Circle) -> tuple[list[str], list[str]]:
+    """Paths of the parts of the list, and of the cells' objects, of an area around a corner of parts."""
+    corner = int(area.x / SHARD_M)
+    shards = [made.shard(row, column) for row in (corner - 1, corner) for column in (corner - 1, corner)]
+    parts = [blob_path(sha256(pack_frame(pack_shard(shard))).digest()) for shard in shards]
+    cells = [
+        blob_path(digest.tobytes())
+        for shard in shards
+        for digest in shard.layers[POINTS_LAYER].hashes[area.overlaps(shard.boxes)]
+    ]
+    return parts, cells
+
+
+def first_windows(served: ServedMadeMap, cells: int, repeats: int, *, lifted: bool) -> int:
+    """Compare first windows with gets, and print."""
+    corner_m = served.side * CELL_M // SHARD_M // 4 * SHARD_M
+    area = shmmap.Circle(corner_m, corner_m, WINDOW_M)
+    parts, objects = objects_of(MadeMap(cells, POINTS), area)
+    least = {"gets": math.inf, "daemon": math.inf}
+    with slow_link(Plan(served.port, MBIT_S, DELAY_S)) as link:
+
+        def noted(name: str, before: tuple[int, int, int], begin_s: float) -> None:
+            took_s = time.perf_counter() - begin_s
+            least[name] = min(least[name], took_s)
+            now = *served.sent(), link.received_bytes()
+            cells_sent, others_sent, nbytes = (one - other for one, other in zip(now, before, strict=True))
+            print(
+                f"{name:6} {took_s:.3f} s; sent {cells_sent} objects of cells, {others_sent} others,"
+                f" {nbytes / 1e6:.3f} MB; load {os.getloadavg()[0]:.1f}",
+                flush=True,
+            )
+
+        for _ in range(repeats):
+            before, begin_s = (*served.sent(), link.received_bytes()), time.perf_counter()
+            get_all(link.endpoint, parts)
+            get_all(link.endpoint, objects)
+            noted("gets", before, begin_s)
+            with DaemonProcess(link.endpoint) as one:
+                if lifted:
+                    lift(one.pid)
+                before, begin_s = (*served.sent(), link.received_bytes()), time.perf_counter()
+                with shmmap.connect(one.endpoint) as client:
+                    found = client.area(area, wait=300.0)
+                    assert len(found.cells) == len(objects)
+                    noted("daemon", before, begin_s)
+    ratio = least["daemon"] / least["gets"]
+    print(f"{len(parts)} parts of the list, {len(objects)} cells: {ratio:.3f} of gets (limit {WINDOW_LIMIT})")
+    return int(ratio > WINDOW_LIMIT)
+
+
 def main() -> int:
     """Measure, print and judge."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--cells", type=int, default=10_000_000)
+    parser.add_argument("--cells", type=int, help="default: ten million, one million for the window")
+    parser.add_argument("--window", action="store_true", help="first windows beside bare gets")
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--lift", action="store_true", help="go before unrelated work (needs root)")
     args = parser.parse_args()
     if args.lift:
         lift(os.getpid())
-    with tempfile.TemporaryDirectory(dir="/dev/shm") as folder, serve_made_map(args.cells, POINTS) as served:
+    cells = args.cells or (1_000_000 if args.window else 10_000_000)
+    with tempfile.TemporaryDirectory(dir="/dev/shm") as folder, serve_made_map(cells, POINTS) as served:
+        if args.window:
+            return first_windows(served, cells, args.repeats, lifted=args.lift)
         make_many_cells(Path(folder, "map"), LOCAL_SIDE)
         local = DaemonProcess(Path(folder, "map"))
         rounds = []

@@ -2,8 +2,8 @@
 """A published map of any number of cells, whose objects are generated on request.
 
 ``python -m tests.support.made_map CELLS POINTS`` serves one until stdin is closed.  It prints its port and
-other attributes of `ServedMadeMap`, and answers each line of stdin with the number of cells' objects that it
-has sent whole.
+other attributes of `ServedMadeMap`, and answers each line of stdin with the numbers of cells' objects and of
+other objects that it has sent whole.
 
 An object is a pure function of its cell's number.  The points are those of one of a few patterns, in the box
 of the first cell wherever the cell lies; the last bytes of the object, which only fill it up to a multiple of
@@ -263,10 +263,15 @@ class ServedMadeMap:
         first = json.loads(process.read())
         self.port, self.side, self.mean_object_bytes, self.index_bytes_per_cell = first
 
+    def sent(self) -> tuple[int, int]:
+        """Numbers of cells' objects, and of other objects, sent whole so far."""
+        self._process.write()
+        cells, others = map(int, self._process.read().split())
+        return cells, others
+
     def cells_sent(self) -> int:
         """Number of cells' objects sent whole so far."""
-        self._process.write()
-        return int(self._process.read())
+        return self.sent()[0]
 
     @property
     def url(self) -> str:
@@ -288,10 +293,12 @@ def main() -> None:
     with faulty_web(made.read) as web:
         port = int(web.url.rpartition(":")[2])
         print(json.dumps([port, made.side, made.mean_object_bytes, index_bytes]), flush=True)
-        cells = 0
+        cells = others = 0
         for _ in sys.stdin:
-            cells += sum(status == 200 and made.is_cell(path) for path, status in web.requests())
-            print(cells, flush=True)
+            whole = [made.is_cell(path) for path, status in web.requests() if status == 200]
+            cells += sum(whole)
+            others += len(whole) - sum(whole)
+            print(cells, others, flush=True)
 
 
 if __name__ == "__main__":

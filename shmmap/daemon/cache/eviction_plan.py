@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which segments are evicted next: a list of those that clients will need last, without any I/O.
 
-All residents are looked at, some in each step, and at most `MAX_LISTED` are listed.  The list is not kept up
-to date: whether a segment may still be evicted is asked again when its turn comes
-(`shmmap.daemon.cache.evictor`), and another list is made while clients move and memory is short.
+All residents are looked at, some in each step, and at most `MAX_LISTED` are listed.  Once as many are listed,
+only those in squares of the map that can matter are scored.  The list is not kept up to date: whether a
+segment may still be evicted is asked again when its turn comes (`shmmap.daemon.cache.evictor`), and another
+list is made while clients move and memory is short.
 """
 
 from __future__ import annotations
@@ -20,11 +21,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.daemon.records import Resident
-from shmmap.daemon.travel.places import NOWHERE, PAIRS_PER_BLOCK, Places, until_needed
+from shmmap.daemon.travel.places import NOWHERE, PAIRS_PER_BLOCK, Places, Squares, until_needed
 
-MAX_LISTED: Final = 2048
+MAX_LISTED: Final = 1024
 BLOCK: Final = 64
-"""Segments looked at in a step: 0.1 to 0.2 ms; fewer where there are many places."""
+"""Segments looked at together; fewer where there are many places."""
+WORK_PER_STEP: Final = 12_000
+"""Work after which a step ends: half a millisecond."""
+LOOK_WORK: Final = 64
+"""Work of looking at a segment."""
+LIST_WORK: Final = 128
+"""Work of listing it."""
 HAND_OUT_GRACE_S: Final = 1.0
 """A segment that was just handed out is not evicted for this long, so that its reader can open it."""
 MAX_SCORE: Final = 1e12
@@ -89,6 +96,8 @@ class EvictionPlan:
         The candidates, the one that goes first at the end.
     is_whole
         Whether all candidates were listed, but for some whose grace ends later.
+    work
+        Work of making it so far.
     """
 
     places: Places = field(default_factory=lambda: NOWHERE)
@@ -96,13 +105,19 @@ class EvictionPlan:
     now_s: float = -math.inf
     listed: list[Candidate] = field(default_factory=list)
     is_whole: bool = True
+    work: int = 0
 
     def make(self, residents: Iterator[Resident], may_go: Callable[[Resident], bool]) -> Iterator[None]:
         """Look at all residents, some in each step, and list those that may go."""
         block = min(BLOCK, 2 * PAIRS_PER_BLOCK // max(1, len(self.places)))
+        squares = Squares(self.places, self.now_s)
         heap: list[Candidate] = []
+        begun = self.work
         while some := list(islice(residents, block)):
-            for one in self._candidates(some):
+            before = squares.looked_at
+            few = self._above(heap[0], some, squares) if len(heap) == MAX_LISTED else some
+            self.is_whole &= len(few) == len(some)
+            for one in self._candidates(few):
                 if len(heap) == MAX_LISTED and one < heap[0]:
                     self.is_whole = False
                 elif may_go(one.resident):
@@ -110,10 +125,25 @@ class EvictionPlan:
                     if len(heap) > MAX_LISTED:
                         heapq.heappop(heap)
                         self.is_whole = False
-            if len(some) == block:
+            pairs = len(self.places) * (len(few) + squares.looked_at - before)
+            self.work += LOOK_WORK * len(some) + LIST_WORK * len(few) + pairs
+            if self.work >= begun + WORK_PER_STEP:
                 yield
+                begun = self.work
         self.listed = sorted(heap)
         self.is_whole |= bool(heap) and not self.listed[-1].is_past_grace  # others are in their grace, too
+
+    def _above(self, least: Candidate, some: Sequence[Resident], squares: Squares) -> Sequence[Resident]:
+        """Leave out segments that go later than ``least``, by what is known of their squares."""
+        if not len(self.places):
+            return some
+        ranks = []
+        for resident, latest_s in zip(some, squares.latest_s(one.box for one in some), strict=True):
+            most = min((latest_s + SOON_S) * math.sqrt(resident.nbytes), MAX_SCORE)
+            most += SPARE_SCORE * resident.spare
+            is_past_grace = self.now_s - resident.last_use_s >= HAND_OUT_GRACE_S
+            ranks.append((is_past_grace, not resident.sessions, is_past_grace and most))
+        return [resident for resident, rank in zip(some, ranks, strict=True) if rank >= least[:3]]
 
     def add(self, some: Sequence[Resident]) -> None:
         """List some more."""

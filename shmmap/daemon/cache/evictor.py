@@ -17,18 +17,18 @@ from dataclasses import dataclass, field
 from itertools import islice
 from typing import Final
 
+import numpy as np
+
 from shmmap.daemon.cache.eviction_plan import (
     BLOCK,
     HAND_OUT_GRACE_S,
     MAX_LISTED,
     Candidate,
     EvictionPlan,
-    eviction_scores,
 )
 from shmmap.daemon.cache.reclaimer import Reclaimer
 from shmmap.daemon.records import Resident
-from shmmap.daemon.travel.places import NOWHERE, Places
-from shmmap.large_tables import ShardedDict
+from shmmap.daemon.travel.places import NOWHERE, WORK_S, Places, until_needed
 
 PREFETCHED_PER_TURN: Final = 64
 """Prefetched segments compared with a wish at a time: a tenth of a millisecond."""
@@ -36,10 +36,13 @@ PRESSURE_S: Final = 10.0
 """How long plans are made after memory was short.  A load helps to replace an outdated plan that is older."""
 FREE_SHARE: Final = 8
 """Divisor: the first plan is made when less than 1/8 of the budget is free."""
-PLAN_S: Final = 0.25
-"""Shortest interval of plans that no load waits for."""
-PAUSE_S: Final = 0.008
-"""Interval of their steps: these take a twentieth of a core at most."""
+PLACES_S: Final = 0.25
+"""Shortest interval of merging clients' positions, which takes up to half a millisecond."""
+PLAN_S: Final = 1.0
+"""Shortest interval of plans that no load waits for: in a second, the time until a segment is needed hardly
+changes."""
+REST: Final = 3
+"""... and in multiples of the time that a plan takes."""
 LOOKS_PER_CALL: Final = 4
 """Segments looked at by one `Evictor.free`: a look takes 15 us, and retiring one is as much work again."""
 
@@ -71,6 +74,7 @@ class Evictor:
     _next: EvictionPlan = field(default_factory=EvictionPlan)
     _making: Iterator[None] | None = None  # of the next plan
     _stepped_s: float = -math.inf
+    _rests_until_s: float = -math.inf
     _placed: tuple[Places, int] = (NOWHERE, -1)
     _placed_s: float = -math.inf
     _pressure_until_s: float = -math.inf
@@ -129,8 +133,9 @@ class Evictor:
             del ledger.prefetched[resident]
             ledger.prefetched[resident] = None
         places, _version = self._positions(now_s)
-        least, *scores = eviction_scores([wished, *some], places, now_s).tolist()
-        later = sorted((its, number) for number, its in enumerate(scores) if its > least)
+        boxes = np.array([one.box for one in (wished, *some)])
+        wished_s, *times_s = until_needed(boxes, places, now_s).tolist()
+        later = sorted((its_s, number) for number, its_s in enumerate(times_s) if its_s > wished_s)
         work = LOOKS_PER_CALL
         while later and shortage > 0 and work:
             resident = some[later.pop()[1]]
@@ -174,24 +179,32 @@ class Evictor:
         if self._stepped_s >= self._pressure_until_s and not self._will_be_needed:
             return math.inf
         if self._making is not None:
-            return self._stepped_s + PAUSE_S
-        return max(self._stepped_s + PAUSE_S, self._plan.now_s + PLAN_S) if self._is_outdated else math.inf
+            return self._rests_until_s
+        interval_s = max(PLAN_S, REST * WORK_S * self._plan.work)
+        return max(self._rests_until_s, self._plan.now_s + interval_s) if self._is_outdated else math.inf
 
     def run_step(self, now_s: float) -> None:
         """Make a part of the next plan; once it is made, it takes the place of the present one."""
         self._stepped_s = now_s
-        ledger = self.reclaimer.ledger
         if self._making is None:
-            ledger.evictable.new = ShardedDict()
             self._next = EvictionPlan(*self._positions(now_s), now_s)
-            self._making = self._next.make(ledger.segments.walk(), lambda one: self._may_go(one, now_s))
+            self._making = self._next.make(self._all(), lambda one: self._may_go(one, now_s))
+        before = self._next.work
         if next(self._making, self) is self:
             self._plan, self._making = self._next, None
+        self._rests_until_s = now_s + WORK_S * (self._next.work - before)
+
+    def _all(self) -> Iterator[Resident]:
+        """Yield all segments; those that are yielded are not new any more."""
+        ledger = self.reclaimer.ledger
+        for resident in ledger.segments.walk():
+            ledger.evictable.new.pop(resident, None)
+            yield resident
 
     def _positions(self, now_s: float) -> tuple[Places, int]:
-        """Return positions of clients and their version, at most `PLAN_S` old: merging them takes long."""
+        """Return positions of clients and their version, at most `PLACES_S` old."""
         sessions = self.reclaimer.sessions
-        if sessions.places_version != self._placed[1] and now_s >= self._placed_s + PLAN_S:
+        if sessions.places_version != self._placed[1] and now_s >= self._placed_s + PLACES_S:
             self._placed_s, self._placed = now_s, (sessions.places(), sessions.places_version)
         return self._placed
 

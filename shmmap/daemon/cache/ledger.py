@@ -91,7 +91,7 @@ class Evictable:
     Attributes
     ----------
     new : ShardedDict
-        Segments that entered service or were released since the last plan was begun.
+        Segments that entered service or were released since a plan looked at them.
     changes : int
         How often that happened.
     """

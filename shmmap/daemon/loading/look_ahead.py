@@ -4,9 +4,10 @@
 The area that a client asks for is moved along its path in steps: cells that enter it at a step are needed
 when the client arrives there.  The path is the route that the client sent.  Without a route, and beyond its
 end, the path continues straight ahead and, a little later, to both sides, because the client may turn; the
-longer the client has moved straight ahead, the farther.  All paths are looked along again and again, a few
+longer the client has moved straight ahead, the farther.  All paths are looked along again and again, some
 steps at a time, and what is missing is listed in the order in which it is needed.  Whether a cell is still
-missing is asked again when its turn comes.
+missing is asked again when its turn comes.  With many clients the paths are looked along less often, and
+farther.
 
 The list has two readers: `shmmap.daemon.loading.prefetcher`, into memory, when no demand waits for a loader,
 and `shmmap.daemon.loading.outages`, onto the disk.  The look-ahead, in seconds of travel, is the longest
@@ -21,7 +22,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import islice, product
+from itertools import product
 from operator import attrgetter
 from typing import Final, NamedTuple
 
@@ -31,7 +32,9 @@ from numpy.typing import NDArray
 from shmmap.daemon.loading.loads import PREFETCH
 from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.travel.motion import Motion
-from shmmap.geometry import Area
+from shmmap.daemon.travel.places import WORK_S
+from shmmap.geometry import Area, Box
+from shmmap.origin.spatial_index import touches
 
 LOADS: Final = 64
 """Number of recent loads from which the time of a load is estimated."""
@@ -100,10 +103,14 @@ class OriginHealth:
 
 PASS_S: Final = 1.0
 """Shortest interval at which all paths are looked along."""
-PER_STEP_S: Final = 0.002
-"""... for each step: it takes a twentieth of that."""
-LONGEST_PASS_S: Final = 2.0
-"""... and longest: what moves too fast for that is fetched late."""
+LOOK_WORK: Final = 8000
+"""Work of finding the cells around a part of a path."""
+CELL_WORK: Final = 75
+"""Work of asking whether a cell is missing."""
+USUAL_PASS_S: Final = 2.0
+"""Interval that the look-ahead allows for; it is longer where the interval is longer."""
+STEPS_TOGETHER: Final = 16
+"""Steps along a path for which the cells around are found together; fewer where cells are many."""
 MAX_LISTED: Final = 4096
 """Cells listed if there are more than twice as many: those needed first."""
 SLOWEST_MPS: Final = 0.5
@@ -142,12 +149,16 @@ class ClientPath:
         Last requested area and layers.
     jumps
         Number of jumps of its position, as of the last `Prefetch.follow`.
+    work
+        Work of looking along it so far.
     """
 
     motion: Motion
     area: Area
     layers: tuple[str, ...]
     jumps: int = -1
+    work: int = 0
+    _together: int = 1
 
     @property
     def pace_s(self) -> float:
@@ -164,19 +175,34 @@ class ClientPath:
         self, catalogue: CatalogueView, ahead: LookAhead, step_m: float
     ) -> Iterator[tuple[float, list[int]]]:
         """Look along the path: yield for each step in how many seconds which cells come into the area."""
-        ahead_m, end_m = 0.0, self._end_m(ahead) if self.moves else 0.0
-        inside = self._known(catalogue, self.area, 0.0) if end_m else np.empty(0, np.intp)
-        while ahead_m < end_m and len(inside) <= MAX_CELLS:
-            here_m, ahead_m, before = ahead_m, min(ahead_m + step_m, end_m), inside
-            inside = self._around(catalogue, ahead_m, ahead_m * self.pace_s <= ahead.sides_s)
-            yield here_m * self.pace_s, np.setdiff1d(inside, before, assume_unique=True).tolist()
+        here_m, end_m = 0.0, self._end_m(ahead) if self.moves else 0.0
+        last: list[Area] = [self.area]
+        while here_m < end_m:
+            marks_m = [min(here_m + step_m * number, end_m) for number in range(1, self._together + 1)]
+            marks_m = marks_m[: math.ceil((end_m - here_m) / step_m)]
+            steps = [last, *self._areas(marks_m, ahead.sides_s)]
+            cells, inside = self._cells_inside(catalogue, steps, here_m * self.pace_s)
+            if np.count_nonzero(inside[0]) > MAX_CELLS:
+                return
+            for number, before_m in enumerate([here_m, *marks_m[:-1]], 1):
+                yield before_m * self.pace_s, cells[inside[number] & ~inside[number - 1]].tolist()
+            here_m, last = marks_m[-1], steps[-1]
+            self._together = max(1, min(STEPS_TOGETHER, MAX_CELLS // max(1, len(cells))))
 
-    def _known(self, catalogue: CatalogueView, area: Area, needed_in_s: float) -> NDArray[np.intp]:
-        """Return the known cells of an area; request missing pages of it, and keep its loaded ones."""
-        found, _known = catalogue.query(area, MAX_CELLS)
+    def _cells_inside(
+        self, catalogue: CatalogueView, steps: Sequence[Sequence[Area]], needed_in_s: float
+    ) -> tuple[NDArray[np.intp], list[NDArray[np.bool_]]]:
+        """Return known cells, and for each step which of them are in its areas; request missing pages."""
+        areas = [area for step in steps for area in step]
         if (pages := catalogue.pages) is not None and not catalogue.complete:
-            pages.want(pages.of_area(area), PREFETCH + needed_in_s)
-        return found
+            for area in areas:
+                pages.want(pages.of_area(area), PREFETCH + needed_in_s)
+        bounds = np.array([area.bounds for area in areas])
+        around = Box(*bounds[:, :2].min(axis=0).tolist(), *bounds[:, 2:].max(axis=0).tolist())
+        cells, _known = catalogue.query(around, 2 * MAX_CELLS)
+        boxes = np.asfortranarray(catalogue.boxes_of(cells))
+        self.work += LOOK_WORK + len(cells) * len(areas)
+        return cells, [np.logical_or.reduce([touches(area, boxes) for area in step]) for step in steps]
 
     def looks_s(self, ahead: LookAhead) -> float:
         """Return the look-ahead in seconds."""
@@ -200,31 +226,29 @@ class ClientPath:
         route = self.motion.route
         return 0.0 if route is None else route.length_m - self.motion.along_m
 
-    def _around(self, catalogue: CatalogueView, ahead_m: float, sides: bool) -> NDArray[np.intp]:
-        """Return cells that the client may need after this distance; with ``sides`` also beside the path."""
+    def _areas(self, marks_m: Sequence[float], sides_s: float) -> Iterator[list[Area]]:
+        """Yield the areas that the client may need after each distance; at first also beside the path."""
         motion, left_m = self.motion, self._left_m
-        x, y, heading, wider_m = motion.x, motion.y, math.atan2(motion.vy, motion.vx), 0.0
+        heading, wider_m, at = math.atan2(motion.vy, motion.vx), 0.0, [(motion.x, motion.y)] * len(marks_m)
         if motion.route is not None:
-            wider_m = BESIDE_M
-            x, y = motion.route.at(motion.along_m + ahead_m).tolist()
-            heading = motion.route.last_heading
-        beyond_m = max(ahead_m - left_m, 0.0)
-        rays = [(heading, beyond_m)]
-        if sides and beyond_m:
-            side_m = max(0.0, beyond_m - LATER_S / self.pace_s)
-            rays += [(heading + SPREAD_RAD, side_m), (heading - SPREAD_RAD, side_m)]
-        areas = [
-            self.area.around(x + far_m * math.cos(angle), y + far_m * math.sin(angle), wider_m)
-            for angle, far_m in rays
-        ]
-        found = [self._known(catalogue, area, ahead_m * self.pace_s) for area in areas]
-        return found[0] if len(found) == 1 else np.unique(np.concatenate(found))
+            heading, wider_m = motion.route.last_heading, BESIDE_M
+            at = motion.route.at(motion.along_m + np.array(marks_m)).tolist()
+        for ahead_m, (x, y) in zip(marks_m, at, strict=True):
+            beyond_m = max(ahead_m - left_m, 0.0)
+            rays = [(heading, beyond_m)]
+            if ahead_m * self.pace_s <= sides_s and beyond_m:
+                side_m = max(0.0, beyond_m - LATER_S / self.pace_s)
+                rays += [(heading + SPREAD_RAD, side_m), (heading - SPREAD_RAD, side_m)]
+            yield [
+                self.area.around(x + far_m * math.cos(angle), y + far_m * math.sin(angle), wider_m)
+                for angle, far_m in rays
+            ]
 
 
 READ_PER_CALL: Final = 64
 """Cells of the list that one call passes over because they are not missing any more."""
-LOOKS_PER_CALL: Final = 2
-"""Steps along paths that one call looks: a fifth of a millisecond."""
+WORK_PER_CALL: Final = 20_000
+"""Work after which a call ends: half a millisecond."""
 SLOW_LOADS: Final = 1.6
 """Consecutive loads that a cell may have to wait for."""
 SLACK_S: Final = 3.0
@@ -302,7 +326,7 @@ class Prefetch:
         self._listed: list[_Listed] = []
         self._making: Iterator[None] | None = None  # of the next list
         self._made_s = -math.inf
-        self._steps = 0
+        self._interval_s = PASS_S
         self._is_due = False  # sooner than that
 
     def follow(self, client: Hashable, motion: Motion, area: Area, layers: tuple[str, ...]) -> None:
@@ -317,8 +341,8 @@ class Prefetch:
     @property
     def look_ahead(self) -> LookAhead:
         """Current look-ahead; cells beyond it are not wished for yet."""
-        load_s = SLOW_LOADS * self.health.slow_s + SLACK_S
-        route_s = load_s + SPARE * self._outage_tolerance_s + LONGEST_PASS_S + AFTER_S
+        load_s = SLOW_LOADS * self.health.slow_s + SLACK_S + max(0.0, self._interval_s - USUAL_PASS_S)
+        route_s = load_s + SPARE * self._outage_tolerance_s + USUAL_PASS_S + AFTER_S
         straight_s = load_s + min(self._outage_tolerance_s, self._away_s, GUESSED_S)
         return LookAhead(route_s, straight_s, load_s)
 
@@ -331,9 +355,9 @@ class Prefetch:
         if now_s < self.health.next_try_s():
             return None
         if self._making is None and now_s >= self._next_pass_s:
-            self._steps, self._is_due, self._making = 0, False, self._make(catalogue, now_s)
+            self._is_due, self._making = False, self._make(catalogue, now_s)
         if self._making is not None:
-            if len(list(islice(self._making, LOOKS_PER_CALL))) == LOOKS_PER_CALL:
+            if next(self._making, self) is not self:
                 return None
             self._making, self._made_s = None, now_s
         wish = self._read(reader, now_s)
@@ -357,12 +381,13 @@ class Prefetch:
         return None
 
     def _make(self, catalogue: CatalogueView, now_s: float) -> Iterator[None]:
-        """Look along all paths, a step at a time, and list what is missing on them."""
+        """Look along all paths, a part at a time, and list what is missing on them."""
         ahead, step_m = self.look_ahead, max(SHORTEST_STEP_M, 0.5 * min(catalogue.mean_size))
         found: dict[tuple[int, str], _Listed] = {}
         until_s = math.inf
+        total = work = 0
         for client, path in list(self.paths.items()):
-            jumps = path.jumps
+            jumps, path.work = path.jumps, 0
             for needed_in_s, cells in path.look(catalogue, ahead, step_m):
                 needed_s = now_s + needed_in_s
                 if needed_s >= until_s:
@@ -375,9 +400,13 @@ class Prefetch:
                     first = sorted(found.values(), key=_needed_s)[:MAX_LISTED]
                     found, until_s = {one[1:3]: one for one in first}, first[-1].needed_s
                     self._is_due = True  # the others are listed next time
-                self._steps += 1
-                yield
+                work += path.work + CELL_WORK * len(cells) * len(path.layers)
+                path.work = 0
+                if work >= WORK_PER_CALL:
+                    total, work = total + work, 0
+                    yield
         self._listed = sorted(found.values(), key=_needed_s)
+        self._interval_s = max(PASS_S, WORK_S * (total + work))
 
     def note_origin(self, now_s: float) -> None:
         """Note whether the origin is out, also while no wish may begin."""
@@ -405,8 +434,7 @@ class Prefetch:
 
     @property
     def _next_pass_s(self) -> float:
-        interval_s = min(PER_STEP_S * self._steps, LONGEST_PASS_S)
-        return self._made_s + (PASS_S if self._is_due else max(PASS_S, interval_s))
+        return self._made_s + (PASS_S if self._is_due else self._interval_s)
 
 
 _needed_s = attrgetter("needed_s")

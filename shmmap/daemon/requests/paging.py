@@ -32,7 +32,8 @@ MAX_RETIRED: Final = 20_000
 class Paging:
     """Reports pages that have arrived, or cannot be fetched, and drops pages that nothing needs.
 
-    While the link is idle and a client is connected, pages that nothing needs yet are fetched, too.
+    While the link is idle, no request waits and a client has asked for something, pages that nothing needs
+    yet are fetched, too.
 
     A page is needed while one of its cells has a segment, a load or a pin, or while an unanswered request or
     a session's area may have cells in it.  This class is a background task of the serving loop.
@@ -145,8 +146,11 @@ class Paging:
         if now_s < self._fill_s or not len(self.sessions) or pages.spare() is not None:
             return
         self._fill_s = now_s + FILL_S
-        if len(self.scheduler.loads) or (link is not None and not link.is_idle(now_s)):
+        is_waited_for = len(self.cells) > 0 or len(self.scheduler.loads) > 0
+        if is_waited_for or (link is not None and not link.is_idle(now_s)):
             return
+        if not any(session.requests for session in self.sessions):
+            return  # what a new client asks for comes first
         areas = [session.area for session in self.sessions if session.area is not None]
         place = None
         if areas:

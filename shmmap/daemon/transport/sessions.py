@@ -17,7 +17,7 @@ import msgspec
 from shmmap.daemon.records import Resident
 from shmmap.daemon.transport.connection import Connection, Peer
 from shmmap.daemon.travel.motion import Motion
-from shmmap.daemon.travel.places import NOWHERE, Places, merged_places, places_of
+from shmmap.daemon.travel.places import NOWHERE, Places, differ, merged_places, places_of
 from shmmap.geometry import Area
 from shmmap.logfmt import escaped
 from shmmap.protocol.messages import Holder, Intent
@@ -176,7 +176,7 @@ class Sessions:
     moved : dict
         Sessions that have moved, or requested another area, since the last `follow_moves`.
     places_version : int
-        Changes whenever `places` changes.
+        Changes whenever `places` changes, but for the time.
     """
 
     LIMIT = 4096
@@ -264,8 +264,7 @@ class Sessions:
             session.motion.update(intent, session.last_request_s)
             if intent.route:  # the motion keeps what it needs of a route, which may be long
                 session.intent = msgspec.structs.replace(intent, route=())
-        if session.intent is None:
-            session.places = NOWHERE
-        else:
+        before, session.places = session.places, NOWHERE
+        if session.intent is not None:
             session.places = places_of(session.motion, 0.0 if session.area is None else session.area.reach)
-        self.places_version += 1
+        self.places_version += differ(before, session.places)

@@ -42,8 +42,15 @@ STAY_M: Final = 10.0
 """Margin around a client's reach that counts as needed whatever its route: it may turn or leave it."""
 PAIRS_PER_BLOCK: Final = 4096
 """Pairs of a cell and a place scored together: their tables fit in the processor's cache."""
+WORK_S: Final = 8e-7
+"""Interval for each unit of work, which is to compare one cell with one place or area.  It takes a fortieth
+of that, so that listing what is evicted and what is fetched ahead takes a twentieth of a core at most."""
 FIRST_SIDE_M: Final = 16.0
 """Side of the squares in which places are first merged, where there are too many."""
+SQUARE_M: Final = 100.0
+"""Side of the squares whose cells are judged together, see `Squares`."""
+MAX_SQUARES: Final = 8192
+"""Squares remembered: a larger dict takes long to grow."""
 
 
 def places_of(motion: Motion, reach_m: float) -> Places:
@@ -78,6 +85,11 @@ def places_of(motion: Motion, reach_m: float) -> Places:
     found[1:-1, 4] = 0.5 * apart_m  # between two places the client is no farther from either
     found[-1] = [*found[-2, :2], motion.at_s + left_m / speed, reach_m, math.inf, pace, 0.0, 0.0]
     return found
+
+
+def differ(before: Places, now: Places) -> bool:
+    """Whether places differ by more than their times: the client moved, or will go elsewhere."""
+    return len(before) != len(now) or bool(np.delete(before != now, 2, axis=1).any())
 
 
 def merged_places(some: Iterable[Places]) -> Places:
@@ -123,6 +135,47 @@ def until_needed(boxes: NDArray[np.float64], places: Places, now_s: float) -> ND
             part = slice(begin, begin + together)
             np.minimum(found[part], _until(boxes[part], some, now_s, somewhere=somewhere), out=found[part])
     return found
+
+
+class Squares:
+    """Squares of the map, each with a time within which all cells in it will be needed.
+
+    A cell belongs to the square in which its middle lies.  From the middle of the square it is at most half
+    a diagonal farther away from a place, and as it lies in another direction, each metre of that may count
+    for one and a half more.
+
+    Parameters
+    ----------
+    places, now_s
+        As for `until_needed`.
+
+    Attributes
+    ----------
+    looked_at : int
+        Number of squares for which that time was estimated.
+    """
+
+    def __init__(self, places: Places, now_s: float) -> None:
+        self.looked_at = 0
+        self._now_s = now_s
+        self._latest_s: dict[tuple[float, float], float] = {}
+        half_m = SQUARE_M / math.sqrt(2.0)
+        self._places = places.copy()
+        self._places[:, 2] = np.maximum(places[:, 2], now_s) + 1.5 * half_m * places[:, 5]
+        self._places[:, 3] -= half_m
+
+    def latest_s(self, boxes: Iterable[tuple[float, float, float, float]]) -> list[float]:
+        """Return upper bounds of what `until_needed` says of these cells, seconds."""
+        if len(self._latest_s) > MAX_SQUARES:
+            self._latest_s = {}
+        twice_m = 2.0 * SQUARE_M
+        squares = [((box[0] + box[2]) // twice_m, (box[1] + box[3]) // twice_m) for box in boxes]
+        if others := list(set(squares).difference(self._latest_s)):
+            middles = (np.array(others) + 0.5) * SQUARE_M
+            times = until_needed(np.hstack([middles, middles]), self._places, self._now_s)
+            self._latest_s.update(zip(others, times.tolist(), strict=True))
+            self.looked_at += len(others)
+        return [self._latest_s[square] for square in squares]
 
 
 def _until(

@@ -613,6 +613,23 @@ def test_pages_along_the_path_are_fetched(paged: Paged) -> None:
     paged.daemon.turn_until(lambda: cache.warm.get(ahead, "points"))
 
 
+def test_what_nothing_needs_is_fetched_when_no_request_waits(
+    paged: Paged, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nor before a client that has just come asks for something: that comes first."""
+    begun, now_s = list[object](), time.monotonic()
+    monkeypatch.setattr(paged.pages, "want_nearest", begun.append)
+    paged.paging.run_step(now_s + 10.0)
+    assert begun == []
+    paged.begin(lambda n: m.Area(n, EVERYWHERE, wait=LONG_S))
+    paged.paging.run_step(now_s + 20.0)
+    assert begun == []
+    paged.pages.come(EAST)
+    assert len(paged.answer().cells) == len(ALL)
+    paged.paging.run_step(now_s + 30.0)
+    assert begun == [(0.0, 0.0)]
+
+
 # --- clients ---------------------------------------------------------------------------------------
 
 

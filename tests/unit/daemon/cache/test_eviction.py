@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import math
 import random
+from collections.abc import Iterator
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -12,17 +14,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shmmap.daemon.cache.eviction_plan import (
-    BLOCK,
     HAND_OUT_GRACE_S,
+    LOOK_WORK,
     MAX_LISTED,
     SOON_S,
+    WORK_PER_STEP,
     EvictionPlan,
     eviction_scores,
 )
 from shmmap.daemon.cache.ledger import DUE_PER_CALL, IN_USE_S, MAX_IN_USE_S, SHARE_S, Evictable
 from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.travel.motion import Motion
-from shmmap.daemon.travel.places import PAIRS_PER_BLOCK, Places, merged_places, places_of, until_needed
+from shmmap.daemon.travel.places import Places, Squares, merged_places, places_of, until_needed
 from shmmap.protocol.messages import Intent
 
 coordinates = st.floats(-1e5, 1e5)
@@ -162,29 +165,62 @@ def test_a_plan_is_as_a_sort_says(
 
 
 @pytest.mark.parametrize("clients", [0, 1, 200])
-def test_of_very_many_the_first_are_listed_in_bounded_steps(clients: int) -> None:
-    random.seed(clients)
-    some = [made(str(n), random.uniform(0, 1e4), last_use_s=random.random()) for n in range(MAX_LISTED + 500)]
-    places = merged_places(client(50.0 * n, 100.0) for n in range(clients))
+@pytest.mark.parametrize("length", [0, 20])
+def test_of_very_many_the_first_are_listed_in_bounded_steps(clients: int, length: int) -> None:
+    """As a sort says, although those in squares that cannot matter are not scored."""
+    rng = random.Random(clients)
+    some = [
+        made(str(n), rng.uniform(0, 1e4), rng.uniform(0, 1e4), rng.choice([100, 150]), rng.random())
+        for n in range(MAX_LISTED + 5000)
+    ]
+    for one in some[::7]:
+        one.sessions = {7}
+        one.spare, one.last_use_s = rng.random() < 0.3, rng.choice([1.0, 99.5])
+    routes = [[(50.0 * n + 100.0 * m, 100.0 + 3.0 * n * m) for m in range(length)] for n in range(clients)]
+    places = merged_places(client(50.0 * n, 100.0, 5.0, 2.0, *route) for n, route in enumerate(routes))
     expected = sorted(some, key=lambda one: rank(one, places, 100.0))[:MAX_LISTED]
-    plan, looked = EvictionPlan(places, 1, 100.0), list[int]()
+    plan, looked, asked = EvictionPlan(places, 1, 100.0), [0], list[Resident]()
 
-    def counted(_one: Resident) -> bool:
-        looked[-1] += 1
+    def counted() -> Iterator[Resident]:
+        for one in some:
+            looked[-1] += 1
+            yield one
+
+    def may_go(one: Resident) -> bool:
+        asked.append(one)
         return True
 
-    steps = plan.make(iter(some), counted)
-    looked.append(0)
-    for _ in steps:
+    work = [0]
+    for _ in plan.make(counted(), may_go):
         assert not plan.listed
+        work.append(plan.work)
         looked.append(0)
-    assert MAX_LISTED < sum(looked) <= len(some)
-    assert max(looked) <= BLOCK
-    assert max(looked) * len(places) <= 2 * PAIRS_PER_BLOCK
-    assert len(looked) >= len(some) / max(looked)
+    assert all(WORK_PER_STEP <= now - then <= 3.0 * WORK_PER_STEP for then, now in pairwise(work))
+    assert sum(looked) == len(some)
+    assert max(looked) * LOOK_WORK <= 2 * WORK_PER_STEP
+    assert MAX_LISTED < len(asked) < len(some)
     assert not plan.is_whole
     found = in_turn(plan)
     assert [rank(one, places, 100.0) for one in found] == [rank(one, places, 100.0) for one in expected]
+
+
+@given(
+    st.lists(points, max_size=6),
+    st.lists(st.tuples(points, st.floats(0, 40)), min_size=1, max_size=20),
+    st.floats(0, 100),
+)
+def test_what_is_known_of_a_square_is_no_less_than_of_its_cells(
+    route: list[tuple[float, float]], cells: list[tuple[tuple[float, float], float]], now_s: float
+) -> None:
+    places = merged_places([client(0.0, 0.0, 8.0, -3.0, *route), client(700.0, 50.0)])
+    boxes = [(x, y, x + size, y + 0.5 * size) for (x, y), size in cells]
+    boxes += [(0.01 * x, 0.01 * y, 0.01 * x + 20.0, 0.01 * y + 20.0) for x, y, *_ in boxes]
+    exact = until_needed(np.array(boxes), places, now_s).tolist()
+    squares = Squares(places, now_s)
+    for begin in (0, len(boxes) // 2):
+        bounds = squares.latest_s(boxes[begin:])
+        assert all(bound >= value for bound, value in zip(bounds, exact[begin:], strict=True))
+    assert 0 < squares.looked_at <= len(boxes)
 
 
 def test_more_is_listed_where_it_belongs() -> None:

@@ -15,13 +15,15 @@ from typing import Any
 import pytest
 
 from shmmap.daemon.cache import eviction_plan, reclaimer
-from shmmap.daemon.cache.eviction_plan import BLOCK, HAND_OUT_GRACE_S
-from shmmap.daemon.cache.evictor import LOOKS_PER_CALL, PAUSE_S, PLAN_S, PRESSURE_S, Evictor, Freeing
+from shmmap.daemon.cache.eviction_plan import BLOCK, HAND_OUT_GRACE_S, LIST_WORK, LOOK_WORK, WORK_PER_STEP
+from shmmap.daemon.cache.evictor import LOOKS_PER_CALL, PLAN_S, PRESSURE_S, Evictor, Freeing
 from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.cache.reclaimer import LOOKS_PER_TURN, TICK_S, Reclaimer
 from shmmap.daemon.pins.watch import PinWatch
 from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.transport.sessions import Sessions
+from shmmap.daemon.travel import places
+from shmmap.daemon.travel.places import WORK_S
 from shmmap.protocol.messages import Intent
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import prepare_process
@@ -50,7 +52,7 @@ class Memory:
 
         monkeypatch.setattr(PinWatch, "is_used_elsewhere", counted)
 
-    def publish(self, count: int, nbytes: int = SMALL) -> list[Resident]:
+    def publish(self, count: int, nbytes: int = SMALL, *, prefetched: bool = False) -> list[Resident]:
         made = []
         for number in range(len(self.ledger.segments), len(self.ledger.segments) + count):
             name = f"/shmmap.unit.{number:016x}"
@@ -59,7 +61,8 @@ class Memory:
             self.directory.link(fd, name)
             os.close(fd)
             box = (0.0, 0.0, 1.0, 1.0)
-            made.append(Resident(name, Key(f"{number}", "points"), number, nbytes, 1, box, 0.0, 1.0))
+            key = Key(f"{number}", "points")
+            made.append(Resident(name, key, number, nbytes, 1, box, 0.0, 1.0, prefetched=prefetched))
             self.ledger.enter(made[-1])
         return made
 
@@ -309,7 +312,7 @@ def evicted(memory: Memory, count: int, now_s: float) -> list[Resident]:
 
 
 def test_clients_decide_soon_after_they_have_moved(memory: Memory) -> None:
-    """A plan is made at most each quarter of a second, and none once there was memory for long."""
+    """A plan is made at most each second, and none once there was memory for long."""
     some = memory.publish(30)
     for number, resident in enumerate(some):
         resident.box = (100.0 * number, 0.0, 100.0 * number + 20.0, 20.0)
@@ -342,7 +345,8 @@ def test_clients_decide_soon_after_they_have_moved(memory: Memory) -> None:
 
 def test_of_many_the_first_go_when_all_have_been_looked_at(memory: Memory) -> None:
     """In several calls, or steps while no load waits; what comes meanwhile goes when nothing else is left."""
-    some = memory.publish(2 * BLOCK + 5)
+    per_step = -(-WORK_PER_STEP // (BLOCK * (LOOK_WORK + LIST_WORK))) * BLOCK
+    some = memory.publish(2 * per_step + 5)
     random.Random(3).shuffle(some)
     for number, resident in enumerate(some):
         resident.last_use_s = number / 1e3
@@ -359,7 +363,7 @@ def test_of_many_the_first_go_when_all_have_been_looked_at(memory: Memory) -> No
         at_s, steps = evictor.next_s, steps + 1
         evictor.run_step(at_s)
     assert steps == 3
-    assert at_s == pytest.approx(NOW_S + PLAN_S + 2.0 * PAUSE_S)
+    assert at_s == pytest.approx(NOW_S + PLAN_S + 2.0 * WORK_S * per_step * (LOOK_WORK + LIST_WORK))
     assert evicted(memory, 1, at_s) == [spare]
     last = memory.publish(1)[0]
     rest = len(some) - 100
@@ -407,6 +411,75 @@ def test_the_first_plan_is_made_before_memory_is_short(memory: Memory) -> None:
     assert evictor.next_s == float("inf")
 
 
+@pytest.mark.parametrize("count", [10_000, 20_000, 100_000])
+@pytest.mark.parametrize(("clients", "vertices"), [(1, 0), (8, 0), (1, 200)], ids=["1", "8", "128"])
+def test_plans_take_a_fortieth_of_a_core_at_most(
+    memory: Memory, monkeypatch: pytest.MonkeyPatch, count: int, clients: int, vertices: int
+) -> None:
+    """A unit of work takes 20 ns.  With 1, 8 and about 128 places, while clients move."""
+    ledger, sessions, evictor = memory.ledger, memory.reclaimer.sessions, memory.evictor
+    work, steps, now_s, next_pose_s = 0, list[int](), NOW_S, NOW_S
+    for number in range(count):
+        x, y = 20.0 * (number % 320), 20.0 * (number // 320)
+        box, nbytes = (x, y, x + 20.0, y + 20.0), SMALL * (1 + number % 5)
+        ledger.enter(Resident(f"{number}", Key(f"{number}", ""), number, nbytes, 1, box, 0.0, 1.0))
+    walk, until_needed = ledger.segments.walk, places.until_needed
+
+    def counted_walk() -> Iterator[Resident]:
+        nonlocal work
+        for resident in walk():
+            work += LOOK_WORK
+            yield resident
+
+    def counted_until_needed(boxes: Any, where: Any, now_s: float) -> Any:
+        nonlocal work
+        work += len(boxes) * len(where)
+        return until_needed(boxes, where, now_s)
+
+    monkeypatch.setattr(ledger.segments, "walk", counted_walk)
+    monkeypatch.setattr(places, "until_needed", counted_until_needed)
+    monkeypatch.setattr(eviction_plan, "until_needed", counted_until_needed)
+    who = [sessions.open(connections.of(), "car", NOW_S) for _ in range(clients)]
+    ledger.budget_bytes = ledger.used_bytes
+    while now_s < NOW_S + 4.0:
+        if now_s >= next_pose_s:
+            next_pose_s += 0.1
+            for number, session in enumerate(who):
+                x, y = 12.0 * (now_s - NOW_S), 500.0 * number
+                route = tuple((x + 20.0 * n, y) for n in range(vertices))
+                connections.says(session, Intent(x, y, 12.0, 0.0, None, route), now_s)
+            while sessions.moved:
+                sessions.follow_moves()
+        if evictor.next_s <= now_s:
+            before = work
+            evictor.run_step(now_s)
+            steps.append(work - before)
+        now_s = min(max(evictor.next_s, now_s + 1e-6), next_pose_s)
+    assert max(steps) <= 3 * WORK_PER_STEP
+    assert LOOK_WORK * min(count, 20_000) <= work <= 4.0 / WORK_S + max(steps)
+    found = len(sessions.places())
+    assert found == clients if not vertices else 100 < found <= 128
+    for one in [*walk()]:
+        ledger.segments.remove(one)  # they have no files
+
+
+def test_while_clients_stand_no_other_plan_is_made(memory: Memory) -> None:
+    """Although they send where they are."""
+    memory.publish(3)
+    sessions, evictor = memory.reclaimer.sessions, memory.evictor
+    session = sessions.open(connections.of(), "car", NOW_S)
+
+    def is_planned_after(x: float, now_s: float) -> bool:
+        connections.says(session, Intent(x, 10.0), now_s)
+        sessions.follow_moves()
+        return evictor.next_s < float("inf")
+
+    is_planned_after(5.0, NOW_S)
+    evicted(memory, 1, NOW_S)
+    assert not any(is_planned_after(5.0, NOW_S + second) for second in range(1, 5))
+    assert is_planned_after(6.0, NOW_S + 5.0)
+
+
 def test_a_wish_takes_only_what_is_needed_later(memory: Memory) -> None:
     some = memory.publish(3)
     for number, resident in enumerate(some):
@@ -419,3 +492,18 @@ def test_a_wish_takes_only_what_is_needed_later(memory: Memory) -> None:
     assert free() is Freeing.LATER, "first a plan is made"
     assert [free(), free(), free()] == [Freeing.ENOUGH, Freeing.ENOUGH, Freeing.NO_MORE]
     assert [one.resident for one in memory.ledger.retired.values()] == some[:2]
+
+
+def test_a_full_share_gives_up_what_is_needed_later_whatever_its_size(memory: Memory) -> None:
+    (near,), far = memory.publish(1, LARGE, prefetched=True), memory.publish(6, prefetched=True)
+    for x, resident in zip((200.0, *range(600, 1200, 100)), (near, *far), strict=True):
+        resident.box = (x, 0.0, x + 20.0, 20.0)
+    session = memory.reclaimer.sessions.open(connections.of(), "car", NOW_S)
+    session.state_intent(Intent(0.0, 10.0, vx=10.0))
+    memory.reclaimer.sessions.follow_moves()
+    wish = Resident("", Key("wish", "points"), 99, SMALL, 0, (400.0, 0.0, 420.0, 20.0), 0.0, 0.0)
+    assert memory.evictor.give_up_prefetched(2 * SMALL, NOW_S, wish)
+    assert [one.resident for one in memory.ledger.retired.values()] == far[:-3:-1], "needed last"
+    assert memory.evictor.give_up_prefetched(99 * SMALL, NOW_S, wish)
+    assert list(memory.ledger.prefetched) == [near]
+    assert not memory.evictor.give_up_prefetched(SMALL, NOW_S, wish)

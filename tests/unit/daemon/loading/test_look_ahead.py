@@ -15,14 +15,16 @@ from hypothesis import strategies as st
 from shmmap.daemon.loading import look_ahead
 from shmmap.daemon.loading.look_ahead import (
     BESIDE_M,
+    CELL_WORK,
     IN_A_ROW,
-    LONGEST_PASS_S,
-    LOOKS_PER_CALL,
+    LOOK_WORK,
     MAX_CELLS,
     PASS_S,
     PROBE_S,
     READ_PER_CALL,
     SLACK_S,
+    USUAL_PASS_S,
+    WORK_PER_CALL,
     ClientPath,
     LookAhead,
     OriginHealth,
@@ -31,8 +33,10 @@ from shmmap.daemon.loading.look_ahead import (
     Wish,
 )
 from shmmap.daemon.travel.motion import Motion
+from shmmap.daemon.travel.places import WORK_S
 from shmmap.geometry import Area, Circle
 from shmmap.origin.catalogue import Catalogue
+from shmmap.origin.spatial_index import touches
 from shmmap.protocol.messages import Intent
 from shmmap.segment.layout import SourceStamp
 
@@ -370,7 +374,7 @@ def test_what_has_failed_comes_first_in_the_next_pass() -> None:
     assert second.cell != first.cell
     daemon.failed.clear()
     for _ in range(1000):
-        wish = daemon.next(1.0 + LONGEST_PASS_S)
+        wish = daemon.next(1.0 + PASS_S)
         assert wish is not None
         if wish.cell == first.cell:
             break
@@ -475,29 +479,72 @@ def test_another_map_means_other_cells() -> None:
     assert daemon.wishes(1.2) == []
 
 
-def test_one_call_looks_at_little() -> None:
+class Work:
+    """Counts the work of looking along paths, beside the code that limits it."""
+
+    def __init__(self, daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.done = 0
+        count, query, is_absent = self, Catalogue.query, daemon.is_absent
+
+        class Counted(Catalogue):
+            def query(self, *arguments, **named):  # type: ignore[no-untyped-def]
+                count.done += LOOK_WORK
+                return query(self, *arguments, **named)
+
+        def counted_touches(area, boxes):  # type: ignore[no-untyped-def]
+            count.done += len(boxes)
+            return touches(area, boxes)
+
+        def counted_is_absent(index: int, layer: str) -> bool:
+            count.done += CELL_WORK
+            return is_absent(index, layer)
+
+        monkeypatch.setattr(look_ahead, "touches", counted_touches)
+        daemon.prefetch = Prefetch(counted_is_absent, TOLERANCE_S)
+        boxes = [town().box(index) for index in range(len(town()))]
+        daemon.catalogue = Counted.from_cells(
+            (f"/{number:05}", box, SourceStamp(1, 1, 1)) for number, box in enumerate(boxes)
+        )
+
+
+def test_one_call_looks_at_little(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever there is to look at, one call does a bounded part of it, and says that there is more."""
-
-    class Counted(Catalogue):
-        asked = 0
-
-        def query(self, *arguments, **named):  # type: ignore[no-untyped-def]
-            Counted.asked += 1
-            return super().query(*arguments, **named)
-
-    boxes = [town().box(index) for index in range(len(town()))]
-    counted = Counted.from_cells((f"/{n:05}", box, SourceStamp(1, 1, 1)) for n, box in enumerate(boxes))
     daemon = Daemon()
+    work, calls = Work(daemon, monkeypatch), 0
     for number in range(40):
         daemon.client(str(number), y=5.0 * number - 100.0)
-    daemon.present = {(index, "points") for index in range(len(counted))}
-    calls = 0
+    daemon.present = {(index, "points") for index in range(len(daemon.catalogue))}
     while not calls or daemon.next_s(1.0) == 1.0:
-        before = Counted.asked
-        assert daemon.prefetch.next(counted, 1.0, daemon.reader) is None
-        assert Counted.asked - before <= 4 * LOOKS_PER_CALL  # where it is, and three paths ahead
+        before = work.done
+        assert daemon.prefetch.next(daemon.catalogue, 1.0, daemon.reader) is None
+        assert work.done - before <= 2 * WORK_PER_CALL + LOOK_WORK
         calls += 1
-    assert calls >= 40 * TOLERANCE_S * 10.0 / 10.0 / LOOKS_PER_CALL
+    assert calls >= 0.5 * work.done / WORK_PER_CALL
+
+
+@pytest.mark.parametrize("clients", [1, 8, 128])
+def test_looking_takes_a_twentieth_of_a_core_at_most(clients: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A unit of work takes 20 ns.  With many clients all paths are looked along less often, and farther."""
+    daemon = Daemon()
+    work = Work(daemon, monkeypatch)
+    motions = [daemon.client(str(number), y=number % 40 * 10.0 - 200.0) for number in range(clients)]
+    daemon.present = {(index, "points") for index in range(len(daemon.catalogue))}
+    alone, passes = daemon.prefetch.look_ahead, list[tuple[float, int]]()
+    for half in range(2, 30):
+        now_s = 0.5 * half
+        for number, motion in enumerate(motions):
+            y = number % 40 * 10.0 - 200.0
+            move(motion, 10.0 * (now_s - 1.0), y, now_s, ((-20.0, y), (1300.0, y)))
+        before = work.done
+        assert daemon.next(now_s) is None
+        if work.done > before:
+            passes.append((now_s, work.done - before))
+    for (begin_s, done), (end_s, _) in pairwise(passes):
+        assert done * WORK_S <= end_s - begin_s
+    ahead = daemon.prefetch.look_ahead
+    assert ahead.route_s - alone.route_s == pytest.approx(ahead.sides_s - alone.sides_s)
+    assert (ahead.route_s > alone.route_s) is (passes[-1][1] * WORK_S > USUAL_PASS_S)
+    assert (len(passes) > 10) is (clients <= 8)
 
 
 def test_one_call_passes_over_few() -> None:
