@@ -6,14 +6,17 @@ from __future__ import annotations
 import os
 import stat
 import sys
+import time
 from collections.abc import Callable, Iterator
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import zmq
 
 from shmmap import BadRequest
+from shmmap.client import event_stream
 from shmmap.events import EventStream, MissedEvents
 from shmmap.protocol import events as e
 from tests.process.conftest import DaemonFactory
@@ -91,6 +94,20 @@ def test_events_come_in_order(
     assert (evicted.version, evicted.why) == (newer.version, "request")
     assert [h.seq for h in found] == list(range(1, 12))
     assert {h.epoch for h in found} == {client.epoch} == {stream.epoch}
+
+
+def test_what_happened_before_is_left_out(
+    served: DaemonProcess, connect: Connect, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A clock is put in place of this process's, by which ten seconds ago was just before the cell came."""
+    with EventStream(served.endpoint, timeout=30.0, since=60.0) as all_of_it:
+        connect(served, name="driver").selected(["0_0.pcd"])
+        *_, joined, loaded = until(all_of_it, lambda h: isinstance(h, e.Loaded))
+    between_s = (joined.unix_ns + loaded.unix_ns) * 0.5e-9
+    clock = SimpleNamespace(time=lambda: between_s + 10.0, monotonic=time.monotonic)
+    monkeypatch.setattr(event_stream, "time", clock)
+    with EventStream(served.endpoint, timeout=30.0, since=10.0) as stream:
+        assert stream.next(30.0) == loaded
 
 
 @pytest.mark.parametrize(("quota", "code"), [("0.9", "quota"), ("4M", "over_budget")])
