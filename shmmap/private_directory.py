@@ -232,7 +232,7 @@ def open_output(path: str | os.PathLike[str]) -> int:
     Raises
     ------
     NotPrivate
-        See `refuse_planted`.
+        Another account has made a link, a pipe or a device of that name.
     OSError
         It cannot be opened.
     """
