@@ -23,8 +23,8 @@ PROGRAM = Path(__file__).parents[1] / "support" / "upgraded_program.py"
 REPLACED = "shmmap.errors.Replaced shmmap was replaced while this program runs: start it again"
 BROKEN, GOOD = "-60_-60.pcd", "0_0.pcd"
 
-HURRIED = ("client.around#1", "client.around#2", "stream.next#0")
-"""Uses without a wait: what they return depends on how far the daemon is."""
+HURRIED = ("client.around#1", "client.around#2", "stream.next#0", "window.error")
+"""Uses without a wait: what they return depends on how far the daemon is, or what the window has noticed."""
 
 _FILES = {"shmmap.read_cloud", "shmmap.read_cloud#0", "shmmap.write_pcd", "shmmap.write_pcd#0"}
 _LAYERS = {"layers", "shmmap.layers"}

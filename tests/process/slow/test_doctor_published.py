@@ -198,7 +198,7 @@ def test_credentials_that_cannot_be_used(bucket: DaemonProcess, web: FaultyWeb, 
         monkeypatch.setenv("AWS_SESSION_TOKEN", "a token")
         monkeypatch.setenv("AWS_CREDENTIAL_EXPIRATION", "2026-01-01T00:00:00Z")
         found = doctor(bucket, "--config", str(file))[1]["credentials"]
-        assert found["fact"].startswith("they expired at 2026-01-01T00:00:00Z")
+        assert found["fact"].startswith("the credentials in the environment expired at 2026-01-01T00:00:00Z")
         assert "half of a pair" not in json.dumps(found)
 
 
