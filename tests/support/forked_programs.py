@@ -361,7 +361,8 @@ def _fork_for_adoption(run: Callable[[], NoReturn]) -> int:
 class _Stem:
     """A fork of a program that is about to run; workers that the program starts are forks of it in turn.
 
-    It is made before the program has threads, ends with it, and does not show the program's environment.
+    It is made before the program has threads, and ends with it, a moment later: so it shows nothing of the
+    program's environment, and keeps none of its files open.
     """
 
     def __init__(self) -> None:
@@ -372,6 +373,11 @@ class _Stem:
             die_with(program)
             signal.signal(signal.SIGINT, signal.SIG_IGN)
             _show({"module": __name__, "words": [], "environment": {}})
+            nowhere = os.open(os.devnull, os.O_RDWR)
+            for fd in range(3):
+                os.dup2(nowhere, fd)
+            os.close(nowhere)
+            os.chdir("/")
             theirs.send(b"ready")
             _fork_workers(theirs, program)
         theirs.close()
@@ -386,7 +392,7 @@ class _Stem:
         ours, theirs = channel()
         request = _request(module, arguments, os.environ, "/", adopted=new_session)
         with self._lock, theirs, _adopting():
-            socket.send_fds(self._socket, [json.dumps(request).encode()], [theirs.fileno()])
+            socket.send_fds(self._socket, [json.dumps(request).encode()], [theirs.fileno(), 2])
             pid = int(self._socket.recv(64))
         return _Adopted(pid, [sys.executable, "-m", module]), ours
 
@@ -394,22 +400,24 @@ class _Stem:
 def _fork_workers(requests: socket.socket, program: int) -> NoReturn:
     """Fork workers of a program, whenever it asks for one."""
     while True:
-        data, fds, _, _ = socket.recv_fds(requests, _REQUEST_BYTES, 1)
+        data, fds, _, _ = socket.recv_fds(requests, _REQUEST_BYTES, _FDS)
         if not data:
             os._exit(0)  # the program has ended
-        pid = _fork_for_adoption(partial(_work, json.loads(data), fds[0], requests, program))
+        pid = _fork_for_adoption(partial(_work, json.loads(data), fds, requests, program))
         requests.send(str(pid).encode())
-        os.close(fds[0])
+        for fd in fds:
+            os.close(fd)
 
 
-def _work(request: dict[str, Any], fd: int, requests: socket.socket, program: int) -> NoReturn:
-    """Be a worker of a program, once this fork is its child."""
+def _work(request: dict[str, Any], fds: list[int], requests: socket.socket, program: int) -> NoReturn:
+    """Be a worker of a program, once this fork is its child; ``fds``: its socket and the program's stderr."""
     requests.close()
+    fd, errors = fds
     end_s = time.monotonic() + _ADOPTED_S
     while os.getppid() != program and time.monotonic() < end_s:
         time.sleep(0.0005)
     request["words"] = [str(fd), str(program), *request["words"]]
-    _become(request, [os.open(os.devnull, os.O_WRONLY)])
+    _become(request, [os.open(os.devnull, os.O_WRONLY), errors])
     _run(request["module"])
 
 
