@@ -63,7 +63,7 @@ class Attacher:
     def attach(
         self, handle: Handle, cell_id: str, segment: str, access: Access, *, populate: bool = False
     ) -> Cell:
-        """Return the cell of a handle; a cell that is `attached` is shared.
+        """Return the cell of a handle that is not `attached` yet; whoever asks for it again shares it.
 
         Parameters
         ----------
@@ -84,8 +84,6 @@ class Attacher:
         ShmmapWarning
             Points of the cell lie outside its box; issued once per cell.
         """
-        if (cell := self.attached(handle)) is not None:
-            return cell
         attached = attach(
             segment,
             offset=handle.offset,

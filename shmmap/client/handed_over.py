@@ -100,7 +100,7 @@ def _attached(access: Access, epoch: int, cell_id: str, handle: Handle, named: s
     for name in (handle.segment, retired_name(handle.segment)):
         try:
             with _lock:
-                cell = _attacher.attach(handle, cell_id, name, access)
+                cell = _attacher.attached(handle) or _attacher.attach(handle, cell_id, name, access)
             published = cell._attached.published
         except (StaleHandle, SegmentCorrupt):
             continue

@@ -62,7 +62,8 @@ class Segments:
         return name, Handle(cell_id, version, layer, name, 0, header.total_bytes, rows, *box)
 
     def attach(self, name: str, handle: Handle) -> Cell:
-        return self.attacher.attach(handle, handle.id, name, Access(self.path, 99, None))
+        access = Access(self.path, 99, None)
+        return self.attacher.attached(handle) or self.attacher.attach(handle, handle.id, name, access)
 
     def cell(self, cell_id: str, columns: dict[str, NDArray[Any]], **options: Any) -> Cell:
         return self.attach(*self.publish(cell_id, columns, **options))
