@@ -30,7 +30,7 @@ from shmmap.client.map_listing import MapListing
 from shmmap.statistics.reader import StatisticsReader
 from tests.process.conftest import DaemonFactory
 from tests.support.command_line import Shmmap
-from tests.support.daemon_process import Deadline
+from tests.support.daemon_process import Deadline, until
 from tests.support.divided_map import DividedMap, make_map
 
 DEADLINE_S = 60.0
@@ -277,6 +277,12 @@ class TopScreen:
             lines = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", whole).split("\r\n")
         return lines
 
+    def stops(self) -> None:
+        """Wait until the program is stopped, not ended."""
+        ended = os.waitid(os.P_PID, self.program.pid, os.WSTOPPED | os.WEXITED | os.WNOWAIT)
+        assert ended is not None
+        assert ended.si_code == os.CLD_STOPPED, ended
+
     def press(self, keys: str) -> None:
         os.write(self._ours, keys.encode())
 
@@ -349,7 +355,7 @@ def test_top_stops_and_goes_on(shmmap: Shmmap) -> None:
     with TopScreen(shmmap, 80, 24) as top:
         top.until(lambda lines: "q quit" in lines[-1])
         top.program.send_signal(signal.SIGTSTP)
-        os.waitid(os.P_PID, top.program.pid, os.WSTOPPED | os.WNOWAIT)
+        top.stops()
         top.raw = read_until(top._ours, b"\x1b[?1049l", top.raw)
         assert termios.tcgetattr(top._theirs) == top._before
         top.program.send_signal(signal.SIGCONT)
@@ -357,6 +363,18 @@ def test_top_stops_and_goes_on(shmmap: Shmmap) -> None:
         top.until(lambda lines: "q quit" in lines[-1])
         top.press("q")
         assert top.ended() == 0
+
+
+def test_top_stops_while_the_terminal_takes_nothing(shmmap: Shmmap) -> None:
+    with TopScreen(shmmap, 80, 24) as top:
+        top.until(lambda lines: "q quit" in lines[-1])
+        until(lambda: not select.select([], [top._theirs], [], 0)[1])  # nobody reads: it is full
+        top.program.send_signal(signal.SIGTSTP)
+        top.raw = read_until(top._ours, b"\x1b[?1049l", b"")
+        top.stops()
+        top.program.send_signal(signal.SIGCONT)
+        top.raw = b""
+        top.until(lambda lines: "q quit" in lines[-1])
 
 
 def test_a_dumb_terminal_gets_it_once(shmmap: Shmmap) -> None:

@@ -49,6 +49,7 @@ class FullScreen:
         with contextlib.suppress(OSError, ValueError):  # stdin may be closed
             if sys.stdin.isatty() and _is_ours(sys.stdin.fileno()):
                 self._input = sys.stdin.fileno()
+        sys.stdout.flush()
         self._take()
         self._stopped_by = signal.signal(signal.SIGTSTP, self._stop)
         return self
@@ -58,6 +59,7 @@ class FullScreen:
     ) -> None:
         signal.signal(signal.SIGTSTP, self._stopped_by)
         with contextlib.suppress(OSError):  # the terminal may be gone
+            sys.stdout.flush()
             self._give()
 
     @property
@@ -93,13 +95,11 @@ class FullScreen:
         if self._input >= 0:
             self._before = termios.tcgetattr(self._input)
             tty.setcbreak(self._input)
-        sys.stdout.write(_ENTER)
-        sys.stdout.flush()
+        _write(_ENTER)
 
     def _give(self) -> None:
         try:
-            sys.stdout.write(_LEAVE)
-            sys.stdout.flush()
+            _write(_LEAVE)
         finally:
             if self._before:
                 with contextlib.suppress(termios.error):
@@ -111,6 +111,13 @@ class FullScreen:
         self._give()
         os.kill(os.getpid(), signal.SIGSTOP)
         self._take()
+
+
+def _write(text: str) -> None:
+    """Write to the terminal past the buffer of stdout: that may be in use while a signal is handled."""
+    data = text.encode()
+    while data:
+        data = data[os.write(sys.stdout.fileno(), data) :]
 
 
 def _is_ours(fd: int) -> bool:
