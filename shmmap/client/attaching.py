@@ -63,7 +63,7 @@ class Attacher:
     def attach(
         self, handle: Handle, cell_id: str, segment: str, access: Access, *, populate: bool = False
     ) -> Cell:
-        """Return the cell of a handle that is not `attached` yet; whoever asks for it again shares it.
+        """Return the cell of a handle that is not `attached` yet.
 
         Parameters
         ----------

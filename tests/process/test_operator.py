@@ -368,7 +368,7 @@ def test_top_stops_and_goes_on(shmmap: Shmmap) -> None:
 def test_top_stops_while_the_terminal_takes_nothing(shmmap: Shmmap) -> None:
     with TopScreen(shmmap, 80, 24) as top:
         top.until(lambda lines: "q quit" in lines[-1])
-        until(lambda: not select.select([], [top._theirs], [], 0)[1])  # nobody reads: it is full
+        until(lambda: not select.select([], [top._theirs], [], 0)[1])  # it is full
         top.program.send_signal(signal.SIGTSTP)
         top.raw = read_until(top._ours, b"\x1b[?1049l", b"")
         top.stops()
