@@ -411,7 +411,7 @@ def test_the_first_plan_is_made_before_memory_is_short(memory: Memory) -> None:
     assert evictor.next_s == float("inf")
 
 
-@pytest.mark.parametrize("count", [10_000, 20_000, 100_000])
+@pytest.mark.parametrize("count", [10_000, 20_000, pytest.param(100_000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("clients", "vertices"), [(1, 0), (8, 0), (1, 200)], ids=["1", "8", "128"])
 def test_plans_take_a_fortieth_of_a_core_at_most(
     memory: Memory, monkeypatch: pytest.MonkeyPatch, count: int, clients: int, vertices: int

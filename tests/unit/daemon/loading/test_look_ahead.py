@@ -522,7 +522,7 @@ def test_one_call_looks_at_little(monkeypatch: pytest.MonkeyPatch) -> None:
     assert calls >= 0.5 * work.done / WORK_PER_CALL
 
 
-@pytest.mark.parametrize("clients", [1, 8, 128])
+@pytest.mark.parametrize("clients", [1, 8, pytest.param(128, marks=pytest.mark.slow)])
 def test_looking_takes_a_twentieth_of_a_core_at_most(clients: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """A unit of work takes 20 ns.  With many clients all paths are looked along less often, and farther."""
     daemon = Daemon()
