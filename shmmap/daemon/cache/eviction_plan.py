@@ -150,16 +150,23 @@ class EvictionPlan:
         self.listed += self._candidates(some)
         self.listed.sort()
 
-    def first(self) -> Candidate | None:
-        """Return the candidate that goes first; what was used since it was listed goes last."""
-        while self.listed:
+    def settle(self, may_go: Callable[[Resident], bool]) -> bool:
+        """Bring the candidate that goes first to the end of the list; return False if that takes longer.
+
+        Those that may not go any more are dropped; what was used since it was listed goes last.
+        """
+        for _ in range(BLOCK):
+            if not self.listed:
+                return True
             one = self.listed[-1]
             unused = -one.resident.last_use_s
-            if unused == one.unused:
-                return one
+            is_listed = may_go(one.resident)
+            if is_listed and unused == one.unused:
+                return True
             del self.listed[-1]
-            insort(self.listed, one._replace(is_past_grace=False, score=0.0, unused=unused))
-        return None
+            if is_listed:
+                insort(self.listed, one._replace(is_past_grace=False, score=0.0, unused=unused))
+        return False
 
     def score(self, resident: Resident) -> float:
         """Return the score that a segment would have had."""

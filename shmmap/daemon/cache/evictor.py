@@ -23,7 +23,6 @@ from shmmap.daemon.cache.eviction_plan import (
     BLOCK,
     HAND_OUT_GRACE_S,
     MAX_LISTED,
-    Candidate,
     EvictionPlan,
 )
 from shmmap.daemon.cache.reclaimer import Reclaimer
@@ -96,7 +95,9 @@ class Evictor:
         if self._plan.listed and now_s >= self._plan.now_s + PRESSURE_S and self._is_outdated:
             self.run_step(now_s)
         for _ in range(LOOKS_PER_CALL):
-            first = self._first(now_s)
+            if not self._plan.settle(lambda one: self._may_go(one, now_s)):
+                break
+            first = self._plan.listed[-1] if self._plan.listed else None
             if first is None or not first.is_past_grace:
                 if self._list_more(now_s):
                     break
@@ -144,12 +145,6 @@ class Evictor:
             shortage -= resident.nbytes
             work -= 1
         return work < LOOKS_PER_CALL
-
-    def _first(self, now_s: float) -> Candidate | None:
-        """Return the candidate that goes first; those that may not go any more are dropped."""
-        while (first := self._plan.first()) is not None and not self._may_go(first.resident, now_s):
-            self._plan.listed.pop()
-        return first
 
     def _may_go(self, resident: Resident, now_s: float) -> bool:
         """Whether a segment is in service, not needed, and was not found in use a moment ago."""

@@ -30,6 +30,7 @@ MAX_COLD: Final = 1 << 14
 """Limit of cells noted between two turns as requested but not in memory; the oldest are dropped."""
 MAX_ENDED: Final = 1024
 """Limit of ended loads noted between two turns; the oldest are dropped."""
+LEARNED_PER_STEP: Final = 64
 FOLLOW_S: Final = 0.005
 """How long a few clients' moves may wait, or ended loads while no client moves, to be handled together."""
 KEPT: Final = 4
@@ -65,7 +66,7 @@ class Prefetcher:
         self._sessions, self._ledger, self._evictor = cache.sessions, cache.ledger, cache.evictor
         self._layers, self._events, self._statistics = cache.layers, cache.events, cache.statistics
         self.cold: deque[tuple[Session, Key]] = deque(maxlen=MAX_COLD)
-        self.ended: deque[tuple[Load, Attempt | None, bool]] = deque(maxlen=MAX_ENDED)
+        self.ended: deque[tuple[Attempt | None, bool]] = deque(maxlen=MAX_ENDED)
         self.share, self.outage_tolerance_s = share, outage_tolerance_s
         self.prefetch = Prefetch(self._is_missing, outage_tolerance_s)
         self._reader = Reader(self._is_absent)
@@ -75,7 +76,7 @@ class Prefetcher:
         self._full_until_s = self._followed_s = self._answered_s = -math.inf
         self._swapped_s = -math.inf
         self._running: dict[Load, int] = {}
-        self._no_room = False
+        self._no_room = self._has_followed = False
 
     @property
     def budget_bytes(self) -> float:
@@ -119,21 +120,28 @@ class Prefetcher:
     @property
     def next_s(self) -> float:
         """When there is something to do: at once if clients moved, loads ended, or a path is examined."""
+        return min(self._news_s, self._next_s if self.prefetch.paths else math.inf)
+
+    @property
+    def _news_s(self) -> float:
+        """When moves of clients and ends of loads are to be handled."""
         many = len(self._sessions.moved) > MOVES_PER_STEP
         if self.cold or many or (self.ended and self.prefetch.paths):
             return -math.inf
-        next_s = self._next_s if self.prefetch.paths else math.inf
-        return min(next_s, self._followed_s + FOLLOW_S) if self._sessions.moved or self.ended else next_s
+        return self._followed_s + FOLLOW_S if self._sessions.moved or self.ended else math.inf
 
     def run_step(self, now_s: float) -> None:
-        """Follow some clients that moved, and prefetch the cell that is needed first."""
+        """Follow some clients that moved, or prefetch the cell that is needed first, in turn."""
         self._now_s = now_s
-        self._followed_s = now_s
-        for session in self._sessions.follow_moves():
-            self._follow(session)
-        self._count_misses()
-        while self.ended:
-            self._learn(*self.ended.popleft())
+        self._has_followed = not self._has_followed and self._news_s <= now_s
+        if self._has_followed:
+            self._followed_s, self._next_s = now_s, -math.inf
+            for session in self._sessions.follow_moves():
+                self._follow(session)
+            self._count_misses()
+            for _ in range(min(LEARNED_PER_STEP, len(self.ended))):
+                self._learn(*self.ended.popleft())
+            return
         self.prefetch.note_origin(now_s)
         if now_s < self._full_until_s:
             self._next_s = self._full_until_s
@@ -219,20 +227,20 @@ class Prefetcher:
 
     def note_end(self, load: Load, *, out: bool) -> None:
         """Note the end of a load, and whether its source was unreachable."""
-        self.ended.append((load, load.attempt, out))
+        self._running.pop(load, None)
+        self.ended.append((load.attempt, out))
 
     def started(self, load: Load) -> None:
         """Note that a loader has begun a wish."""
         self._statistics.add("prefetch_started", load not in self._running)
         self._running[load] = load.estimate
 
-    def _learn(self, load: Load, attempt: Attempt | None, out: bool) -> None:
+    def _learn(self, attempt: Attempt | None, out: bool) -> None:
         """Infer from the end of a load whether its origin answers.
 
         A broken file counts as an answer.  The failure of a load that began before another load succeeded
         belongs to an outage that has ended.
         """
-        self._running.pop(load, None)
         if attempt is None or not attempt.sources:
             return
         if out and self._now_s - attempt.took_s < self._answered_s:

@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shmmap.daemon.cache.eviction_plan import (
+    BLOCK,
     HAND_OUT_GRACE_S,
     LOOK_WORK,
     MAX_LISTED,
@@ -110,9 +111,9 @@ def made_plan(some: list[Resident], places: Places, now_s: float) -> EvictionPla
 def in_turn(plan: EvictionPlan) -> list[Resident]:
     """Those that go, in order."""
     found = []
-    while (one := plan.first()) is not None:
-        found.append(one.resident)
-        plan.listed.pop()
+    while plan.listed:
+        if plan.settle(lambda _one: True) and plan.listed:
+            found.append(plan.listed.pop().resident)
     return found
 
 
@@ -230,6 +231,27 @@ def test_more_is_listed_where_it_belongs() -> None:
     plan.add([middle])
     assert in_turn(plan) == [far, middle, near]
     assert plan.score(far) > plan.score(middle) > plan.score(near)
+
+
+@pytest.mark.parametrize("how", ["used", "needed"])
+def test_however_many_were_used_since_or_are_needed_few_are_passed_over_at_a_time(how: str) -> None:
+    some = [made(str(number), number) for number in range(3 * BLOCK)]
+    plan = made_plan(some, client(0.0, 0.0), 10.0)
+    for one in some[1:]:
+        one.last_use_s = 10.0 if how == "used" else 0.0
+    asked: list[Resident] = []
+
+    def may_go(one: Resident) -> bool:
+        asked.append(one)
+        return how == "used" or one is some[0]
+
+    calls = 1
+    while not plan.settle(may_go):
+        assert len(asked) == calls * BLOCK
+        calls += 1
+    assert calls == 3
+    assert plan.listed[-1].resident is some[0]
+    assert len(plan.listed) == (len(some) if how == "used" else 1)
 
 
 # --- what was found in use ------------------------------------------------------------------------

@@ -100,7 +100,8 @@ def test_loads_that_were_begun_in_an_outage_do_not_make_another_one(
     def end(after_s: float, took_s: float, out: bool) -> tuple[bool, int]:
         load.attempt = Attempt(0.0, (bytes(24),), took_s=took_s)
         prefetcher.note_end(load, out=out)
-        prefetcher.run_step(now_s + after_s)
+        while prefetcher.ended:
+            prefetcher.run_step(now_s + after_s)
         return health.is_out, health.failed_in_a_row
 
     for number in range(IN_A_ROW):
