@@ -27,10 +27,10 @@ MAX_LISTED: Final = 1024
 BLOCK: Final = 64
 """Segments looked at together; fewer where there are many places."""
 WORK_PER_STEP: Final = 12_000
-"""Work after which a step ends: half a millisecond."""
-LOOK_WORK: Final = 64
+"""Work after which a step ends: a quarter of a millisecond."""
+LOOK_WORK: Final = 96
 """Work of looking at a segment."""
-LIST_WORK: Final = 128
+LIST_WORK: Final = 256
 """Work of listing it."""
 HAND_OUT_GRACE_S: Final = 1.0
 """A segment that was just handed out is not evicted for this long, so that its reader can open it."""
@@ -112,38 +112,50 @@ class EvictionPlan:
         block = min(BLOCK, 2 * PAIRS_PER_BLOCK // max(1, len(self.places)))
         squares = Squares(self.places, self.now_s)
         heap: list[Candidate] = []
+        few: list[Resident] = []  # to be scored together
         begun = self.work
         while some := list(islice(residents, block)):
-            before = squares.looked_at
-            few = self._above(heap[0], some, squares) if len(heap) == MAX_LISTED else some
-            self.is_whole &= len(few) == len(some)
-            for one in self._candidates(few):
-                if len(heap) == MAX_LISTED and one < heap[0]:
-                    self.is_whole = False
-                elif may_go(one.resident):
-                    heapq.heappush(heap, one)
-                    if len(heap) > MAX_LISTED:
-                        heapq.heappop(heap)
-                        self.is_whole = False
-            pairs = len(self.places) * (len(few) + squares.looked_at - before)
-            self.work += LOOK_WORK * len(some) + LIST_WORK * len(few) + pairs
+            before, known = squares.looked_at, len(few)
+            few += self._above(heap[0], some, squares) if len(heap) == MAX_LISTED else some
+            self.is_whole &= len(few) - known == len(some)
+            self.work += LOOK_WORK * len(some) + len(self.places) * (squares.looked_at - before)
+            if len(few) >= block:
+                self._list(few[:block], heap, may_go)
+                few = few[block:]
             if self.work >= begun + WORK_PER_STEP:
                 yield
                 begun = self.work
+        self._list(few, heap, may_go)
         self.listed = sorted(heap)
         self.is_whole |= bool(heap) and not self.listed[-1].is_past_grace  # others are in their grace, too
 
+    def _list(
+        self, some: Sequence[Resident], heap: list[Candidate], may_go: Callable[[Resident], bool]
+    ) -> None:
+        """Score segments, and put those into the ``heap`` that may go before others in it."""
+        for one in self._candidates(some):
+            if len(heap) == MAX_LISTED and one < heap[0]:
+                self.is_whole = False
+            elif may_go(one.resident):
+                heapq.heappush(heap, one)
+                if len(heap) > MAX_LISTED:
+                    heapq.heappop(heap)
+                    self.is_whole = False
+        self.work += (LIST_WORK + len(self.places)) * len(some)
+
     def _above(self, least: Candidate, some: Sequence[Resident], squares: Squares) -> Sequence[Resident]:
         """Leave out segments that go later than ``least``, by what is known of their squares."""
-        if not len(self.places):
+        if not (len(self.places) and least.is_past_grace):
             return some
-        ranks = []
-        for resident, latest_s in zip(some, squares.latest_s(one.box for one in some), strict=True):
-            most = min((latest_s + SOON_S) * math.sqrt(resident.nbytes), MAX_SCORE)
-            most += SPARE_SCORE * resident.spare
-            is_past_grace = self.now_s - resident.last_use_s >= HAND_OUT_GRACE_S
-            ranks.append((is_past_grace, not resident.sessions, is_past_grace and most))
-        return [resident for resident, rank in zip(some, ranks, strict=True) if rank >= least[:3]]
+        score, is_held = least.score, not least.is_unclaimed
+        latest_s = squares.latest_s([one.box for one in some])
+        return [
+            one
+            for one, its_s in zip(some, latest_s, strict=True)
+            if (its_s + SOON_S) * math.sqrt(one.nbytes) >= score
+            or one.spare
+            or (is_held and not one.sessions)
+        ]
 
     def add(self, some: Sequence[Resident]) -> None:
         """List some more."""

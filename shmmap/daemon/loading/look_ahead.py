@@ -106,13 +106,15 @@ PASS_S: Final = 1.0
 """Shortest interval at which all paths are looked along."""
 LOOK_WORK: Final = 8000
 """Work of finding the cells around a part of a path."""
-CELL_WORK: Final = 75
+CELL_WORK: Final = 150
 """Work of asking whether a cell is missing."""
 USUAL_PASS_S: Final = 2.0
 """Interval that the look-ahead allows for; it is longer where the interval is longer."""
 STEPS_TOGETHER: Final = 8
 """Steps along a path for which the cells around are found together; fewer where cells are many."""
-MAX_LISTED: Final = 4096
+ASKED_TOGETHER: Final = 64
+"""Cells of a step along a path that are asked for together."""
+MAX_LISTED: Final = 1024
 """Cells listed if there are more than twice as many: those needed first."""
 SLOWEST_MPS: Final = 0.5
 """A slower client counts as standing; without a route its path is unknown."""
@@ -186,7 +188,9 @@ class ClientPath:
             if np.count_nonzero(inside[0]) > MAX_CELLS:
                 return
             for number, before_m in enumerate([here_m, *marks_m[:-1]], 1):
-                yield before_m * self.pace_s, cells[inside[number] & ~inside[number - 1]].tolist()
+                new = cells[inside[number] & ~inside[number - 1]].tolist()
+                for begin in range(0, max(1, len(new)), ASKED_TOGETHER):
+                    yield before_m * self.pace_s, new[begin : begin + ASKED_TOGETHER]
             here_m, last = marks_m[-1], steps[-1]
             self._together = max(1, min(STEPS_TOGETHER, MAX_CELLS // max(1, len(cells))))
 

@@ -166,16 +166,16 @@ class Squares:
 
     def latest_s(self, boxes: Iterable[tuple[float, float, float, float]]) -> list[float]:
         """Return upper bounds of what `until_needed` says of these cells, seconds."""
-        if len(self._latest_s) > MAX_SQUARES:
-            self._latest_s = {}
-        twice_m = 2.0 * SQUARE_M
-        squares = [((box[0] + box[2]) // twice_m, (box[1] + box[3]) // twice_m) for box in boxes]
-        if others := list(set(squares).difference(self._latest_s)):
+        known, twice_m = self._latest_s, 2.0 * SQUARE_M
+        if len(known) > MAX_SQUARES:
+            known.clear()
+        squares = [((x0 + x1) // twice_m, (y0 + y1) // twice_m) for x0, y0, x1, y1 in boxes]
+        if others := list({square for square in squares if square not in known}):
             middles = (np.array(others) + 0.5) * SQUARE_M
             times = until_needed(np.hstack([middles, middles]), self._places, self._now_s)
-            self._latest_s.update(zip(others, times.tolist(), strict=True))
+            known.update(zip(others, times.tolist(), strict=True))
             self.looked_at += len(others)
-        return [self._latest_s[square] for square in squares]
+        return [known[square] for square in squares]
 
 
 def _until(
