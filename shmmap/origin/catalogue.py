@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cells of one map at one moment: ids, boxes, stamps, versions, area queries, changes; map origins."""
+"""The cells of one map at one moment: ids, boxes, stamps, versions, area queries, changes."""
 
 from __future__ import annotations
 
@@ -370,32 +370,6 @@ def _places(ascending: NDArray[np.bytes_], wanted: NDArray[np.bytes_]) -> Indice
     places = np.minimum(ascending.searchsorted(narrow), len(ascending) - 1)
     places[ascending[places] != wanted] = -1
     return places
-
-
-class MapOrigin(Protocol):
-    """Source of one map's catalogue.
-
-    A loader reads each cell.  It raises `Offline` if the source cannot be reached at present: the cell stays
-    ``offline`` until the next attempt.
-    """
-
-    @property
-    def path(self) -> str:
-        """Path or URL of the map, as users write it."""
-
-    def load(self, *, fresh: bool = False, before: object | None = None) -> Catalogue:
-        """Read the catalogue of the map's present state.
-
-        ``fresh`` reads every file's stamp instead of using a cached catalogue.  The result may share
-        unchanged tables with ``before``, an earlier state.
-
-        Raises
-        ------
-        MapMissing, MapDataError
-            The map does not exist, or cannot be served.
-        Offline
-            The map's storage cannot be reached at present.
-        """
 
 
 class NoMap:
