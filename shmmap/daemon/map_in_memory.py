@@ -323,7 +323,7 @@ class MapInMemory:
                     on_message=on_message,
                     places=fetched.places,
                 ),
-                self.waiting,
+                self.waiting.load_finished,
                 clock=clock,
                 prefetch_share=config.prefetch_share,
                 outage_tolerance_s=config.outage_tolerance_s,

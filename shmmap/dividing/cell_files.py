@@ -112,10 +112,7 @@ class CellFiles:
     def written(self, pieces: Sequence[tuple[int, int, int, int, int]]) -> None:
         """Note pieces in the journal: (ix, iy, offset, bytes, hash of the bytes) each."""
         with self._journal_lock:
-            os.lseek(self._journal, 0, os.SEEK_END)
-            left = memoryview(np.array(pieces, _PIECE).tobytes())
-            while len(left):
-                left = left[os.write(self._journal, left) :]
+            write_at((self._journal, "", self.noted_bytes()), np.array(pieces, _PIECE).tobytes())
 
     @property
     def has_journal(self) -> bool:

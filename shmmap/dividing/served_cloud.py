@@ -29,7 +29,7 @@ from shmmap.formats.cloud import READABLE_SUFFIXES
 from shmmap.formats.coordinate_system import LENGTHS
 from shmmap.formats.durable_file import locked_entry, locked_file
 from shmmap.logfmt import log
-from shmmap.origin.catalogue import Catalogue, MapOrigin
+from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.catalogue_bytes import default_cache_directory
 from shmmap.origin.map_directory import MapDirectory, is_served_whole, open_map
 from shmmap.origin.map_layout import absolute_path
@@ -44,10 +44,6 @@ _USE_LOCK: Final = ".use"  # shared lock, held by every daemon that serves the c
 _MAKING_LOCK: Final = ".making"  # exclusive lock, held by the daemon that divides it
 
 
-def _notify_no_one(*lines: str) -> None:
-    del lines
-
-
 def find_origin(
     map_path: str,
     *,
@@ -57,8 +53,8 @@ def find_origin(
     unit: str = "",
     vertical_unit: str = "",
     drop_noise: bool = False,
-    notify: Callable[..., object] = _notify_no_one,
-) -> MapOrigin:
+    notify: Callable[..., object] = lambda *_lines: None,
+) -> MapDirectory | DividedCloud:
     """Return the origin of the map at a path: a map, or a cloud that must be divided first.
 
     Parameters
@@ -125,7 +121,7 @@ class DividedCloud:
         *,
         strict: bool = False,
         how: tuple[str, str, str] = ("", "", ""),
-        notify: Callable[..., object] = _notify_no_one,
+        notify: Callable[..., object] = lambda *_lines: None,
     ) -> None:
         self.path = path
         self._how = how

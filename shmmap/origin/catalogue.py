@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cells of one map at one moment: ids, boxes, stamps, versions, area queries, changes; map origins."""
+"""The cells of one map at one moment: ids, boxes, stamps, versions, area queries, changes."""
 
 from __future__ import annotations
 
@@ -104,6 +104,15 @@ class Catalogue:
 
     Attributes
     ----------
+    id_prefix, names, boxes, stamps
+        As above; do not write.
+    by_base
+        Indices in order of base names, see `shmmap.origin.cell_names.order_by_base`.
+    made_of_boxes
+        Search structure for area queries.
+    bounds, mean_size
+        Box around all cells, metres, map frame (None if there are no cells), and the mean extent of the cells
+        along x and y.
     opened
         Open directories through which the cells' files are read; None: they are read by path.
 
@@ -130,17 +139,20 @@ class Catalogue:
     ) -> None:
         self._names: CellNames
         self._index: SpatialIndex
-        if before is not None and before.names is names and before.id_prefix == id_prefix:
+        if before is not None and before._names.names is names and before._names.prefix == id_prefix:
             self._names = before._names
         else:
             self._names = CellNames(id_prefix, names, by_base)
-        if before is not None and before.boxes is boxes:
+        if before is not None and before._index.boxes is boxes:
             self._index = before._index
         else:
             if made is None:
                 self._refuse_bad(boxes)
             self._index = SpatialIndex(boxes, made)
-        self._stamps = stamps
+        self.id_prefix, self.names, self.by_base = id_prefix, names, self._names.by_base
+        self.boxes, self.made_of_boxes = self._index.boxes, self._index.made
+        self.bounds, self.mean_size = self.made_of_boxes.bounds, self.made_of_boxes.mean_size
+        self.stamps = stamps
         self._versions = sparse_zeros(len(stamps), np.uint64)  # 0: not computed yet
         self._block_digests: NDArray[np.uint64] | None = None
         self._fixed_digest = fixed_digest
@@ -182,52 +194,6 @@ class Catalogue:
     def __len__(self) -> int:
         return len(self._names)
 
-    @property
-    def id_prefix(self) -> str:
-        """Directory that all ids start with, e.g. ``/maps/city/pointcloud_map.pcd/``."""
-        return self._names.prefix
-
-    @property
-    def names(self) -> NDArray[np.bytes_]:
-        """(N,) bytes, the rest of each id after `id_prefix`; do not write."""
-        return self._names.names
-
-    @property
-    def boxes(self) -> NDArray[np.float64]:
-        """(N, 4) float64, ``min_x, min_y, max_x, max_y``, metres, map frame; do not write."""
-        return self._index.boxes
-
-    @property
-    def bounds(self) -> tuple[float, float, float, float] | None:
-        """Box around all cells, metres, map frame; None if there are no cells."""
-        return self._index.made.bounds
-
-    @property
-    def mean_size(self) -> tuple[float, float]:
-        """Mean extent of the cells along x and y, metres."""
-        return self._index.made.mean_size
-
-    @property
-    def stamps(self) -> NDArray[np.int64]:
-        """(N, 3) int64, size in bytes, mtime_ns, ctime_ns; written by `set_stamp` only."""
-        return self._stamps
-
-    @property
-    def by_base(self) -> NDArray[np.int32]:
-        """Indices in order of base names, see `shmmap.origin.cell_names.order_by_base`; do not write."""
-        return self._names.by_base
-
-    @property
-    def made_of_boxes(self) -> MadeOfBoxes:
-        """Search structure for area queries."""
-        return self._index.made
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of the tables (names, boxes, stamps, index) in bytes, without cached lookups."""
-        tables = (self.names, self.by_base, self._stamps)
-        return sum(int(table.nbytes) for table in tables) + self._index.nbytes
-
     def id(self, index: int) -> str:
         """Return the id of a cell: the absolute path of its file."""
         return self._names.id(index)
@@ -268,15 +234,15 @@ class Catalogue:
 
     def stamp(self, index: int) -> Stamp:
         """Return the last known stamp of a cell's file."""
-        return bytes(self._stamps[index].astype("<i8", copy=False).tobytes())
+        return bytes(self.stamps[index].astype("<i8", copy=False).tobytes())
 
     def source_bytes(self, index: int) -> int:
         """Return the last known size of a cell's file in bytes."""
-        return int(self._stamps[index, 0])
+        return int(self.stamps[index, 0])
 
     def set_stamp(self, index: int, stamp: Stamp) -> None:
         """Correct a cell's stamp in place; its version and the map version follow.  Cheap at any size."""
-        self._stamps[index] = np.frombuffer(stamp, "<i8")
+        self.stamps[index] = np.frombuffer(stamp, "<i8")
         self._versions[index] = 0
         if self._block_digests is not None:
             block = index // _BLOCK_CELLS
@@ -323,7 +289,7 @@ class Catalogue:
         return self._fixed_digest
 
     def _digest_block(self, block: int) -> int:
-        cells = self._stamps[block * _BLOCK_CELLS : (block + 1) * _BLOCK_CELLS]
+        cells = self.stamps[block * _BLOCK_CELLS : (block + 1) * _BLOCK_CELLS]
         return xxh3_64_intdigest(np.ascontiguousarray(cells).data)
 
     pages = None
@@ -404,32 +370,6 @@ def _places(ascending: NDArray[np.bytes_], wanted: NDArray[np.bytes_]) -> Indice
     places = np.minimum(ascending.searchsorted(narrow), len(ascending) - 1)
     places[ascending[places] != wanted] = -1
     return places
-
-
-class MapOrigin(Protocol):
-    """Source of one map's catalogue.
-
-    A loader reads each cell.  It raises `Offline` if the source cannot be reached at present: the cell stays
-    ``offline`` until the next attempt.
-    """
-
-    @property
-    def path(self) -> str:
-        """Path or URL of the map, as users write it."""
-
-    def load(self, *, fresh: bool = False, before: object | None = None) -> Catalogue:
-        """Read the catalogue of the map's present state.
-
-        ``fresh`` reads every file's stamp instead of using a cached catalogue.  The result may share
-        unchanged tables with ``before``, an earlier state.
-
-        Raises
-        ------
-        MapMissing, MapDataError
-            The map does not exist, or cannot be served.
-        Offline
-            The map's storage cannot be reached at present.
-        """
 
 
 class NoMap:

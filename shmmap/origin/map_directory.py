@@ -83,12 +83,14 @@ def open_map(
     MapMissing
         There is no map at ``path``.
     """
-    return MapDirectory(
+    found = MapDirectory(
         path=absolute_path(path),
         metadata=None if metadata is None else absolute_path(metadata),
         strict=strict,
         cache_dir=default_cache_directory() if cache_dir is None else os.path.abspath(cache_dir),
-    ).checked()
+    )
+    find_layout(found.path, found.metadata)
+    return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,11 +105,6 @@ class MapDirectory:
     strict: bool = False
     cache_dir: str = ""
     cached_from_cells: int = _CACHED_FROM_CELLS
-
-    def checked(self) -> MapDirectory:
-        """Return self; raise `MapMissing` if there is no map at this path."""
-        find_layout(self.path, self.metadata)
-        return self
 
     def load(self, *, fresh: bool = False, before: object | None = None) -> Catalogue:
         """Read the map's present cells, with their boxes and their files' stamps.

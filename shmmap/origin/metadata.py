@@ -152,12 +152,8 @@ class EntryCollector:
                 self.report("repeated entry, the last one counts", bytes(names[index]))
             names, corners = names[kept], corners[kept]
         x_key, y_key = _RESOLUTIONS
-        return MapMetadata(
-            names, corners, self.resolutions[x_key], self.resolutions[y_key], tuple(self._problems())
-        )
-
-    def _problems(self) -> list[str]:
-        return [f"{what}: {list_some(keys)}" for what, keys in self._oddities.items()]
+        problems = tuple(f"{what}: {list_some(keys)}" for what, keys in self._oddities.items())
+        return MapMetadata(names, corners, self.resolutions[x_key], self.resolutions[y_key], problems)
 
     def _flush(self) -> None:
         if self._names:

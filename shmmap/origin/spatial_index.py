@@ -110,11 +110,6 @@ class Grid:
         order = np.argsort(keys, kind="stable")
         return cls(frame, keys[order], cells.astype(np.int32)[order])
 
-    @property
-    def nbytes(self) -> int:
-        """Memory of the arrays in bytes."""
-        return int(self.keys.nbytes + self.cells.nbytes)
-
     def runs(self, bounds: Bounds, slack: float, circle: Circle | None = None) -> tuple[Indices, Indices]:
         """Return begins and ends of the runs of `cells` whose box may touch an area.
 
@@ -221,11 +216,6 @@ class SpatialIndex:
         # column-major: the exact test reads one coordinate of many cells at a time
         self.boxes: Floats = np.asfortranarray(boxes)
         self.made = MadeOfBoxes.of(self.boxes) if made is None else made
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of the boxes and the search structure in bytes."""
-        return int(self.boxes.nbytes) + sum(grid.nbytes for grid in self.made.grids)
 
     def query(self, area: Area, most: int | None = None) -> Indices:
         """Return the rows of ``boxes`` that touch ``area`` (closed borders, z range ignored), ascending.

@@ -53,7 +53,9 @@ def measure(root: Path, cache: Path, queries: int) -> None:
     version_s = time.perf_counter() - start
     memory = resident_bytes() - before
     result: dict[str, float] = {"cells": len(catalogue), "load_s": load_s, "version_s": version_s}
-    result.update(memory=memory, tables=catalogue.nbytes, version=version)
+    tables = [catalogue.names, catalogue.by_base, catalogue.stamps, catalogue.boxes]
+    tables += [table for grid in catalogue.made_of_boxes.grids for table in (grid.keys, grid.cells)]
+    result.update(memory=memory, tables=sum(table.nbytes for table in tables), version=version)
     reach = float(catalogue.boxes[:, 2].max())
     rng = np.random.default_rng(1)
     for kind, name in ((Circle, "circle"), (AutowareSquare, "square")):

@@ -77,7 +77,7 @@ class Holders:
         hello again), or if the segment is pinned without any lock.  Loaders open segments, too, and do not
         count.
         """
-        known = [slot for slot in slots if self.reclaimer.sessions.by_slot(slot) is not None]
+        known = [slot for slot in slots if self.reclaimer.sessions.slots.get(slot) is not None]
         ours = slots.count(LOADER_SLOT)
         if len(slots) > len(known) + ours or (not known and not ours and self.reclaimer.is_pinned(resident)):
             known.append(UNKNOWN_SLOT)
@@ -106,7 +106,7 @@ class Holders:
         """Convert bytes and segments by slot into rows of a reply."""
         lines = []
         for slot, (nbytes, cells) in sorted(found.items(), key=lambda item: -item[1][0]):
-            session = self.reclaimer.sessions.by_slot(slot)
+            session = self.reclaimer.sessions.slots.get(slot)
             if session is None:
                 lines.append(Holder(0, 0, -1, "unknown", nbytes, cells))
             else:

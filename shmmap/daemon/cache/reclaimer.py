@@ -276,7 +276,7 @@ class Reclaimer:
         if self._by_key.get(resident.key) is retired:
             del self._by_key[resident.key]
         for slot in list(resident.sessions):
-            session = self.sessions.by_slot(slot)
+            session = self.sessions.slots.get(slot)
             if session is not None:
                 session.drop_segment(resident)
 

@@ -106,9 +106,6 @@ class EvictionHistory:
     def __init__(self) -> None:
         self._versions: OrderedDict[Key, int] = OrderedDict()  # a dict is slow at finding its oldest key
 
-    def __len__(self) -> int:
-        return len(self._versions)
-
     def note_eviction(self, key: Key, version: int) -> None:
         """Note that this version was evicted for lack of memory."""
         self._versions.pop(key, None)
@@ -153,10 +150,6 @@ class PrefetchMisses:
         self._log = log
         self._absent: OrderedDict[tuple[str, str], set[int]] = OrderedDict()  # sessions that wait for each
         self._waited: OrderedDict[int, _Waited] = OrderedDict()  # by session; the next one to publish first
-
-    def __len__(self) -> int:
-        """Return the number of clients remembered."""
-        return len(self._waited)
 
     def note_arrival(self, cell_id: str, layer: str) -> None:
         """Note that a cell has arrived, so that no client waits for it any more."""

@@ -269,8 +269,8 @@ class Loads:
     link
         Counts what running loads fetch from a remote origin; None if cells are files.
 
-    ``by_key`` contains the loads that have not ended; ``failures`` contains why the last load of a key
-    failed, until a load succeeds or the cause may have passed.
+    ``queue`` contains loads that wait, ``by_key`` all that have not ended; ``failures`` contains why the last
+    load of a key failed, until a load succeeds or the cause may have passed.
     """
 
     def __init__(self, ledger: Ledger, link: Link | None = None) -> None:
@@ -278,21 +278,12 @@ class Loads:
         self.by_key: dict[Key, Load] = {}
         self.failures: dict[Key, Failure] = {}
         self._keys_failed: dict[str, OrderedDict[Key, None]] = {}  # by code, oldest first
-        self._queue = LoadQueue()
+        self.queue = LoadQueue()
         self._numbers = 0
 
     def __len__(self) -> int:
         """Return how many loads are queued."""
-        return len(self._queue)
-
-    @property
-    def changes(self) -> int:
-        """Number of changes after which the next load may be another one."""
-        return self._queue.changes
-
-    def queued_of(self, asker: Hashable) -> int:
-        """Return how many of an asker's loads are queued."""
-        return self._queue.count(asker)
+        return len(self.queue)
 
     def want(
         self,
@@ -353,7 +344,7 @@ class Loads:
             load = self.by_key[key] = Load(key, estimate, priority, self._numbers, work, asker, computed)
         if not load.is_running:
             load.priority = min(load.priority, priority)
-            self._queue.push(load, priority, asker)
+            self.queue.push(load, priority, asker)
         return load
 
     def is_promised(self, key: Key) -> bool:
@@ -361,23 +352,11 @@ class Loads:
         load = self.by_key.get(key)
         return load is not None and not isinstance(load.work, FailedFileCheck)
 
-    def choose(self, *, points: bool = True, layers: bool = True, link: bool = True) -> Load | None:
-        """Choose the nearest load of the asker whose turn it is, of the kinds that can start now."""
-        return self._queue.choose(points=points, layers=layers, link=link)
-
-    def wait_for_link(self, load: Load) -> None:
-        """Let a queued load, whose ``link_bytes`` are known now, wait for the link; others may pass it."""
-        self._queue.change_kind(load)
-
-    def bytes_behind(self) -> int:
-        """Return the bytes of some loads that follow the one `choose` has chosen."""
-        return self._queue.bytes_behind()
-
     def start(self, load: Load, attempt: Attempt) -> bool:
         """Reserve the bytes of the chosen load; it runs from now on.  Return False if they do not fit."""
         if not self._ledger.reserve(load.estimate):
             return False
-        self._queue.start(load)
+        self.queue.start(load)
         load.attempt, load.reserved = attempt, load.estimate
         if self._link is not None and load.link_bytes:
             cause: Cause = "ahead" if load.is_ahead else "demand"
@@ -393,18 +372,18 @@ class Loads:
 
     def defer(self, load: Load) -> None:
         """Take a load that cannot start yet out of the queue, until `requeue`."""
-        self._queue.discard(load)
+        self.queue.discard(load)
 
     def requeue(self, load: Load) -> None:
         """Put a running load back (its worker died before it began, or the data read is outdated)."""
         self._take_back(load)
-        self._queue.push(load, load.priority, load.asker)
+        self.queue.push(load, load.priority, load.asker)
 
     def _take_back(self, load: Load) -> None:
         self._ledger.reserved_bytes -= load.reserved
         load.reserved = 0
         if load.attempt is not None:
-            self._queue.end(load, load.attempt.spent_s)
+            self.queue.end(load, load.attempt.spent_s)
             load.attempt = None
             if self._link is not None:
                 self._link.end(load)
@@ -413,7 +392,7 @@ class Loads:
     def finish(self, load: Load, failure: Failure | None = None) -> None:
         """End a load; a ``failure`` stays until a load of the key succeeds or it is cleared."""
         self._take_back(load)
-        self._queue.discard(load)
+        self.queue.discard(load)
         if self.by_key.get(load.key) is load:
             del self.by_key[load.key]
             self.forget_failure(load.key)
@@ -446,7 +425,7 @@ class Loads:
         self.forget_failure(key)
         load = self.by_key.get(key)
         if load is not None and not load.is_running:
-            self._queue.discard(load)
+            self.queue.discard(load)
             del self.by_key[key]
 
     def forget_refusals(self) -> None:

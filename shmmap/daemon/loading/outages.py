@@ -16,12 +16,12 @@ from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.loading.look_ahead import Reader
-from shmmap.daemon.loading.scheduler import Scheduler
+from shmmap.daemon.loading.published_reader import needed_objects
+from shmmap.daemon.loading.scheduler import Scheduler, job_of
 from shmmap.daemon.map.object_keeper import KeptCell, ObjectKeeper
 from shmmap.daemon.map.origin_link import OriginLink
 from shmmap.daemon.records import Key
-from shmmap.layers.points import LAYER
-from shmmap.origin.remote.published_object import ObjectName, unpack_source
+from shmmap.layers.spec import layer_spec
 
 LOOK_S: Final = 0.25
 """Interval of checking whether memory has room and whether loads wait, seconds."""
@@ -122,7 +122,8 @@ class DiskAhead:
         self._lacking.add((wish.cell, wish.layer))
         self._rest[wish.cell, wish.layer] = math.inf
         key = KeptCell(catalogue.map_version, wish.cell, wish.layer)
-        objects = self._objects(wish.cell, wish.layer)
+        job = job_of(self._cache, 0, wish.cell, wish.layer, 0)
+        objects = list(needed_objects(layer_spec(job.layer), job))
         if link is not None:
             link.begin(key, sum(one.size for one in objects), now_s, "ahead")
         self._keeper.keep(key, objects)
@@ -153,12 +154,3 @@ class DiskAhead:
         if self._cache.find_warm(index, layer, self._now_s) is not None:
             return False
         return Key(self._cache.catalogue.id(index), layer) not in self._scheduler.loads.by_key
-
-    def _objects(self, index: int, layer: str) -> list[ObjectName]:
-        """Return the objects that a loader would need for a layer of a cell."""
-        catalogue, layers = self._cache.catalogue, self._cache.layers
-        own = unpack_source(catalogue.source(index))
-        if catalogue.ready(index, layer) is not None:
-            return [own[layer].name]
-        around = layers.neighbours(index, layer)
-        return [own[LAYER].name, *(unpack_source(catalogue.source(near))[LAYER].name for near in around)]

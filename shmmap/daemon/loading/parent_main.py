@@ -22,6 +22,7 @@ import sys
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Final, NoReturn
 
 from shmmap.compile_notices import log_first, watch
@@ -64,93 +65,74 @@ def _compile() -> int:
 
 @dataclass(eq=False, slots=True)
 class _Parent:
-    """Forks loaders; ``_children`` maps pidfds to process ids and the parent's ends of the channels."""
+    """Forks loaders; ``_children`` maps pidfds to process ids and the parent's ends of loaders' channels."""
 
     channel: socket.socket
     settings: WorkerSettings
-    _children: dict[int, tuple[int, socket.socket]] = field(default_factory=dict)
-    _compiling: int = -1
+    _children: dict[int, tuple[int, socket.socket | None]] = field(default_factory=dict)
+    _poller: select.poll = field(default_factory=select.poll)
 
     def run(self) -> None:
         """Fork until the daemon closes the channel."""
-        poller = select.poll()
-        poller.register(self.channel, select.POLLIN)
+        self._poller.register(self.channel, select.POLLIN)
         mark = compiled_mark()
         if mark is not None and not mark.is_file():
-            self._compiling = self._start_compiling()
-            poller.register(self._compiling, select.POLLIN)
+            self._fork(_compile)
         buffer = bytearray(64)
         while True:
-            for fd, _ in poller.poll():
-                if fd == self._compiling:
-                    poller.unregister(fd)
-                    self._end_compiling()
-                    continue
+            for fd, _ in self._poller.poll():
                 if fd in self._children:
-                    poller.unregister(fd)
                     self._reap(fd)
                     continue
-                data, end = receive_packet(self.channel, buffer)
+                data, received = receive_packet(self.channel, buffer)
                 if not data:
                     return
-                if end >= 0:
-                    with contextlib.suppress(OSError):
-                        poller.register(self._fork(socket.socket(fileno=end)), select.POLLIN)
+                if received >= 0:
+                    end = socket.socket(fileno=received)
+                    self._fork(partial(work, end, self.settings), end)
 
-    def _fork(self, end: socket.socket) -> int:
-        """Fork a loader; return its pidfd."""
+    def _fork(self, run: Callable[[], int], end: socket.socket | None = None) -> None:
+        """Run a function in a child; ``end`` is its channel, if it is a loader."""
         ours = os.getpid()
         try:
             pid = os.fork()
         except OSError as error:
             _send_last(end, worker_messages.Ended(-1, f"fork: {error.strerror}"))
-            raise
+            return
         if not pid:
-            self._become_loader(end, ours)
+            self._become_child(ours, run)
         try:
             pidfd = os.pidfd_open(pid)
         except OSError as error:
             os.kill(pid, signal.SIGKILL)
             os.waitpid(pid, 0)
             _send_last(end, worker_messages.Ended(-1, f"pidfd_open: {error.strerror}"))
-            raise
+            return
         self._children[pidfd] = pid, end
-        return pidfd
+        self._poller.register(pidfd, select.POLLIN)
 
-    def _become_loader(self, end: socket.socket, parent: int) -> NoReturn:
+    def _become_child(self, parent: int, run: Callable[[], int]) -> NoReturn:
         self.channel.close()
         for pidfd, (_, other) in self._children.items():
             os.close(pidfd)
-            other.close()
-        _run_child(parent, lambda: work(end, self.settings))
-
-    def _start_compiling(self) -> int:
-        """Start compiling kernels in a child; return its pidfd."""
-        ours = os.getpid()
-        pid = os.fork()
-        if not pid:
-            self.channel.close()
-            _run_child(ours, _compile)
-        return os.pidfd_open(pid)
-
-    def _end_compiling(self) -> None:
-        """Reap the child that compiles; if it failed, each loader compiles the kernels it needs."""
-        os.waitid(os.P_PIDFD, self._compiling, os.WEXITED)
-        os.close(self._compiling)
-        self._compiling = -1
+            if other is not None:
+                other.close()
+        _run_child(parent, run)
 
     def _reap(self, pidfd: int) -> None:
-        """Reap a loader and report how it ended."""
+        """Reap a child, and report how it ended if it was a loader."""
+        self._poller.unregister(pidfd)
         os.close(pidfd)
         pid, end = self._children.pop(pidfd)
         _, status = os.waitpid(pid, 0)
         _send_last(end, worker_messages.Ended(os.waitstatus_to_exitcode(status)))
 
 
-def _send_last(end: socket.socket, message: worker_messages.Ended) -> None:
+def _send_last(end: socket.socket | None, message: worker_messages.Ended) -> None:
     """Send a loader's last message and close its channel; if the channel is full, only close it."""
-    with end, contextlib.suppress(OSError):
-        end.send(worker_messages.encode(message), socket.MSG_DONTWAIT)
+    if end is not None:
+        with end, contextlib.suppress(OSError):
+            end.send(worker_messages.encode(message), socket.MSG_DONTWAIT)
 
 
 def main(arguments: list[str]) -> int:

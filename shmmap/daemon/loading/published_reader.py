@@ -74,7 +74,7 @@ def needed_bytes(job: worker_messages.Job) -> int:
     """Return the bytes of the objects that a job is made from."""
     if job.points and not job.neighbours:
         return 0
-    return sum(name.size for name in _needed(layer_spec(job.layer), job))
+    return sum(name.size for name in needed_objects(layer_spec(job.layer), job))
 
 
 class _Reports:
@@ -154,7 +154,7 @@ class ObjectFetcher:
 
     def begin(self, number: int, spec: LayerSpec, job: CellJob) -> None:
         """Begin to fetch the objects that a layer of a cell is made from."""
-        names = {name.sha256: name for name in _needed(spec, job)}
+        names = {name.sha256: name for name in needed_objects(spec, job)}
         with self._lock:
             self._forget_last()
             self._needs[number] = tuple(names)
@@ -288,7 +288,7 @@ class ObjectFetcher:
             self._finish_if_complete(number)
 
 
-def _needed(spec: LayerSpec, job: CellJob | worker_messages.Job) -> Iterator[ObjectName]:
+def needed_objects(spec: LayerSpec, job: CellJob | worker_messages.Job) -> Iterator[ObjectName]:
     """Yield the objects that a layer of a cell is made from."""
     own = unpack_source(job.source)
     if job.ready:

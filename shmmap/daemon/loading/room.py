@@ -6,7 +6,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from functools import partial
+from typing import Final
 
 from shmmap.daemon.cache.evictor import Evictor, Freeing
 from shmmap.daemon.cache.ledger import Ledger
@@ -24,12 +25,6 @@ AHEAD_SHARE: Final = 32
 """Fraction of the budget (1/32) up to which memory is also freed for loads that follow the next one."""
 AGAIN_S: Final = 0.05
 """Delay after which a load that waits for memory asks again even if nothing has changed: a precaution."""
-
-
-class Refused(NamedTuple):
-    """Why a load cannot have the memory that it needs."""
-
-    why: str
 
 
 @dataclass(eq=False, slots=True)
@@ -50,27 +45,17 @@ class Room:
 
     def watch(self, watched: WatchedDescriptors, clock: Callable[[], float]) -> None:
         """Register for the kernel's reports of events that may free memory."""
-        for fd, call in (
-            (self.reclaimer.closer.fd, self.on_freed),
-            (self.reclaimer.pins.fd, lambda: self.on_closes(clock())),
-            (self.lost.fd, lambda: self.on_names_vanished(clock())),
+        for fd, collect in (
+            (self.reclaimer.closer.fd, self.reclaimer.collect),
+            (self.reclaimer.pins.fd, lambda: self.reclaimer.on_closes(clock())),
+            (self.lost.fd, lambda: self.lost.retire_vanished(clock())),
         ):
             if fd >= 0:
-                watched.watch(fd, call, "memory")
+                watched.watch(fd, partial(self.on_report, collect), "memory")
 
-    def on_closes(self, now_s: float) -> None:
-        """Handle the kernel's report that segments were closed."""
-        if self.reclaimer.on_closes(now_s):
-            self.loads.forget_refusals()
-
-    def on_names_vanished(self, now_s: float) -> None:
-        """Handle the kernel's report that names of segments were removed."""
-        if self.lost.retire_vanished(now_s):
-            self.loads.forget_refusals()
-
-    def on_freed(self) -> None:
-        """Count memory that the kernel has taken back."""
-        if self.reclaimer.collect():
+    def on_report(self, collect: Callable[[], object]) -> None:
+        """Collect a report of the kernel: if memory may be free, loads that were refused may fit now."""
+        if collect():
             self.loads.forget_refusals()
 
     def release(self, residents: Iterable[Resident], now_s: float) -> None:
@@ -78,8 +63,8 @@ class Room:
         self.reclaimer.release(residents, now_s)
         self.loads.forget_refusals()
 
-    def refusal(self, load: Load, shortage: int, behind: int, now_s: float) -> Refused | None:
-        """Free memory for a load; return None if it is under way, or why that is impossible.
+    def why_not(self, load: Load, shortage: int, behind: int, now_s: float) -> str:
+        """Free memory for a load; return why that is impossible, or nothing if it is under way.
 
         Evicted memory is free a moment later.  At the same time more is evicted, for the loads of ``behind``
         bytes that come next: else each of them would have to wait for its own eviction.
@@ -87,16 +72,16 @@ class Room:
         ledger = self.ledger
         if load.work is Purpose.WISH:
             has_room = self.prefetcher.make_room(load, shortage, now_s)
-            return None if has_room else Refused("it will be needed later than others")
+            return "" if has_room else "it will be needed later than others"
         if load.work is Purpose.SPARE:
-            return Refused("no memory is free")
+            return "no memory is free"
         if not ledger.fits_at_all(load.estimate):
             needed, budget = format_bytes(load.estimate), format_bytes(ledger.budget_bytes)
-            return Refused(f"the cell needs {needed}, the whole budget is {budget}")
+            return f"the cell needs {needed}, the whole budget is {budget}"
         more = min(behind, ledger.budget_bytes // AHEAD_SHARE)
-        if any(self._may_come(nbytes, now_s) for nbytes in (shortage + more, shortage)):
-            return None
-        return Refused(f"the budget of {format_bytes(ledger.budget_bytes)} is in use")
+        if self._may_come(shortage + more, now_s) or (more and self._may_come(shortage, now_s)):
+            return ""
+        return f"the budget of {format_bytes(ledger.budget_bytes)} is in use"
 
     def wait(self, running: int, now_s: float) -> None:
         """Make the next load wait for memory, while ``running`` loads are running."""
@@ -115,7 +100,13 @@ class Room:
     def _state(self, running: int) -> tuple[int, ...]:
         """Return a value that differs whenever memory may be free, or another load is next."""
         ledger = self.ledger
-        return ledger.shortage(0), ledger.coming_bytes, ledger.evictable.changes, self.loads.changes, running
+        return (
+            ledger.shortage(0),
+            ledger.coming_bytes,
+            ledger.evictable.changes,
+            self.loads.queue.changes,
+            running,
+        )
 
     def ask(self, worker: Worker, message: Need) -> None:
         """Note that a worker needs more than was reserved for it; it waits for `grant`."""
@@ -134,13 +125,7 @@ class Room:
                 granted = self.loads.grow(load, nbytes)
                 if not granted and ledger.fits_at_all(nbytes):
                     shortage = ledger.shortage(nbytes - load.reserved)
-                    if load.work is Purpose.WISH:
-                        freed = self.prefetcher.make_room(load, shortage, now_s)
-                    elif load.work is Purpose.SPARE:
-                        freed = False
-                    else:
-                        freed = self._may_come(shortage, now_s)
-                    if freed:
+                    if not self.why_not(load, shortage, 0, now_s):
                         continue
                 self.pool.answer(worker, Decision(granted))
             del self.awaiting_grant[number]

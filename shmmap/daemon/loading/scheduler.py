@@ -8,13 +8,12 @@ long.
 
 from __future__ import annotations
 
-import enum
 import math
 import os
 from collections import deque
 from collections.abc import Callable, Hashable, Iterator
 from itertools import islice
-from typing import Final, Protocol
+from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.map_switch import MapSwitch
@@ -128,21 +127,6 @@ def opened_of(catalogue: CatalogueView) -> Opened:
     return catalogue.opened.innermost(catalogue.id_prefix.rstrip("/"))
 
 
-class HandOut(enum.Enum):
-    """What has come of the next load."""
-
-    STARTED = "a worker has it"
-    SETTLED = "it has ended, waits apart from the others, or is other work now"
-    WAITS = "there is none, or it waits for a worker, for memory or for the link"
-
-
-class LoadObserver(Protocol):
-    """Is notified of loads."""
-
-    def load_finished(self, key: Key) -> None:
-        """Handle the end of a load, successful or not."""
-
-
 class Scheduler:
     """Runs loads.
 
@@ -150,6 +134,8 @@ class Scheduler:
     ----------
     make_pool
         Makes the pool, given the function to call with a worker that has sent a message.
+    load_finished
+        Called with the key of a load that has ended, successful or not.
     clock
         The serving loop's clock, seconds.
     prefetch_share, outage_tolerance_s
@@ -173,7 +159,7 @@ class Scheduler:
         cache: CellCache,
         map_switch: MapSwitch,
         make_pool: Callable[[Callable[[Worker], None]], WorkerPool],
-        observer: LoadObserver,
+        load_finished: Callable[[Key], None],
         *,
         clock: Callable[[], float],
         prefetch_share: float = 0.0,
@@ -181,7 +167,7 @@ class Scheduler:
         link: Link | None = None,
         needed_bytes: Callable[[Job], int] | None = None,
     ) -> None:
-        self._cache, self._map_switch, self._observer = cache, map_switch, observer
+        self._cache, self._map_switch, self._load_finished = cache, map_switch, load_finished
         self._ledger, self._layers = cache.ledger, cache.layers
         self._events, self._statistics = cache.events, cache.statistics
         self.link, self._needed_bytes, self._link_s = link, needed_bytes, math.inf
@@ -294,7 +280,7 @@ class Scheduler:
             index, failure = self._cache.index_of(key.cell_id), self.loads.failures.get(key)
             if index is None:
                 self.loads.cancel(key)
-                self._observer.load_finished(key)
+                self._load_finished(key)
             elif failure is not None and failure.stamp not in (None, self._cache.catalogue.stamp(index)):
                 self.loads.forget_failure(key)  # another state of the source
 
@@ -316,43 +302,47 @@ class Scheduler:
         if self.link is not None:
             self.link.update(now_s)
         self._link_s = math.inf
-        self.unfinished = len(self.loads) > 0 and self._hand_out_next(now_s) is not HandOut.WAITS
+        self.unfinished = len(self.loads) > 0 and self._hand_out_next(now_s)
 
-    def _hand_out_next(self, now_s: float) -> HandOut:
-        """Give the next load to a worker, or end it, unless it has to wait."""
+    def _hand_out_next(self, now_s: float) -> bool:
+        """Give the next load to a worker, or settle it otherwise; return whether to go on with the one after.
+
+        If not, there is none, or the next one waits for a worker, for memory or for the link.
+        """
         if self.room.waited_for and self.room.still_waited_for(len(self._jobs), now_s):
-            return HandOut.WAITS
+            return False
         points, layers = self.pool.has_room(computed=False), self.pool.has_room(computed=True)
         if not (points or layers):
-            return HandOut.WAITS
-        load = self.loads.choose(points=points, layers=layers)
+            return False
+        load = self.loads.queue.choose(points=points, layers=layers)
         if load is not None and load.link_bytes and not self._may_fetch(load, now_s):
-            load = self.loads.choose(points=points, layers=layers, link=False)  # what needs none goes on
+            # what needs none goes on
+            load = self.loads.queue.choose(points=points, layers=layers, link=False)
         if load is None:
-            return HandOut.WAITS
+            return False
         index = self._cache.index_of(load.key.cell_id)
         if index is None:  # its cell left the map
             self._end(load)
-            return HandOut.SETTLED
+            return True
         if isinstance(load.work, LeftoverCheck):
             resident = load.work.resident
             if self._ledger.resident_named(resident.name) is not resident:  # it was retired
                 self._load_after_all(load)
-                return HandOut.SETTLED
+                return True
         if load.computed and self._waits_for_pages(load, index, now_s):
-            return HandOut.SETTLED
+            return True
         shortage = self._ledger.shortage(load.estimate) if load.estimate else 0
         if shortage > 0:
-            refused = self.room.refusal(load, shortage, self.loads.bytes_behind(), now_s)
-            if refused is not None:
-                self._fail(load, "over_budget", refused.why, None, now_s)
-                return HandOut.SETTLED
+            why_not = self.room.why_not(load, shortage, self.loads.queue.bytes_behind(), now_s)
+            if why_not:
+                self._fail(load, "over_budget", why_not, None, now_s)
+                return True
             self.room.wait(len(self._jobs), now_s)
-            return HandOut.WAITS
+            return False
         return self._start(load, index, now_s)
 
-    def _start(self, load: Load, index: int, now_s: float) -> HandOut:
-        """Give a load for which there is memory to a worker, if the link has room."""
+    def _start(self, load: Load, index: int, now_s: float) -> bool:
+        """Give a load for which there is memory to a worker, if the link has room; as `_hand_out_next`."""
         layers, layer, attempt = self._layers, load.key.layer, Attempt(now_s)
         if isinstance(load.work, Purpose):
             sources = map(self._cache.catalogue.stamp, (index, *layers.neighbours(index, layer)))
@@ -362,8 +352,8 @@ class Scheduler:
         if self._needed_bytes is not None and isinstance(job, Job):
             load.link_bytes = self._needed_bytes(job)
         if not self._may_fetch(load, now_s):
-            self.loads.wait_for_link(load)
-            return HandOut.SETTLED
+            self.loads.queue.change_kind(load)
+            return True
         self.loads.start(load, attempt)
         self._job_numbers += 1
         is_wish = load.work is Purpose.WISH
@@ -372,18 +362,18 @@ class Scheduler:
         except Replaced:
             message = f"{job.source.name}: no loader can start: {RESTART}"
             self._fail(load, "load_failed", message, None, now_s)
-            return HandOut.SETTLED
+            return True
         except OSError as error:
             self._fail(load, failure_code(error), f"no file for a segment: {error.strerror}", None, now_s)
-            return HandOut.SETTLED
+            return True
         if not taken:
             self.loads.requeue(load)
-            return HandOut.WAITS
+            return False
         self._jobs[job.number] = load
         if is_wish:
             self.prefetcher.started(load)
         self._statistics.add("loads_started", isinstance(job, Job))
-        return HandOut.STARTED
+        return True
 
     def _may_fetch(self, load: Load, now_s: float) -> bool:
         """Whether the link has room for a load; what is made from memory, and checks, need none."""
@@ -596,4 +586,4 @@ class Scheduler:
         """End a load; ``out``: its source did not answer."""
         self.prefetcher.note_end(load, out=out)
         self.loads.finish(load, failure)
-        self._observer.load_finished(load.key)
+        self._load_finished(load.key)

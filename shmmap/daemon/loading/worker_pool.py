@@ -314,13 +314,13 @@ class WorkerPool:
 
     # --- messages --------------------------------------------------------------------------
 
-    def receive(self, worker: Worker) -> tuple[worker_messages.FromWorker, int] | None:
-        """Return a worker's next message and its descriptor (-1: none); None if there is no message now.
+    def next_message(self, worker: Worker, now_s: float) -> worker_messages.FromWorker | None:
+        """Return a worker's next message about its jobs; None if there is none now.
 
         Raises
         ------
         EOFError
-            The worker's parent is gone, and the worker with it, or the message cannot be read.
+            The worker has ended, or cannot be used; says why, if that is known.
         """
         while True:
             try:
@@ -333,27 +333,14 @@ class WorkerPool:
             except OSError as error:
                 raise EOFError from error
         if not data:
-            raise EOFError
+            raise EOFError  # its parent is gone, and the worker with it
         try:
-            return worker_messages.decode_from_worker(data), fd
+            message = worker_messages.decode_from_worker(data)
         except msgspec.MsgspecError as error:
             log.error("loader ended", reason="its message cannot be read", error=error)
             if fd >= 0:
                 os.close(fd)
             raise EOFError("its message could not be read") from error
-
-    def next_message(self, worker: Worker, now_s: float) -> worker_messages.FromWorker | None:
-        """Return a worker's next message about its jobs; None if there is none now.
-
-        Raises
-        ------
-        EOFError
-            The worker has ended, or cannot be used; says why, if that is known.
-        """
-        received = self.receive(worker)
-        if received is None:
-            return None
-        message, fd = received
         if isinstance(message, worker_messages.Ready) and fd >= 0:
             self.begun(worker, message.pid, fd, now_s)
             return None

@@ -7,11 +7,14 @@ import threading
 
 
 class Arrivals:
-    """Bytes that threads of the daemon itself have received; thread-safe."""
+    """Bytes that threads of the daemon itself have received; thread-safe.
+
+    ``pages_bytes`` are those of pages that are being fetched.
+    """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._index = self._ahead = self._pages = 0
+        self._index = self._ahead = self.pages_bytes = 0
 
     def add_index(self, nbytes: int) -> None:
         """Count bytes of the list of cells."""
@@ -26,12 +29,7 @@ class Arrivals:
     def add_pages(self, nbytes: int) -> None:
         """Count bytes of pages that are being fetched; negative when they have come."""
         with self._lock:
-            self._pages += nbytes
-
-    @property
-    def pages_bytes(self) -> int:
-        """Bytes of pages that are being fetched."""
-        return self._pages
+            self.pages_bytes += nbytes
 
     def take(self) -> tuple[int, int]:
         """Return the bytes of the list of cells and of objects since the last call."""

@@ -51,7 +51,7 @@ class Reloader:
     """
 
     def __init__(self, origin: ViewOrigin, served: Callable[[], CatalogueView]) -> None:
-        self._origin = origin
+        self.origin = origin
         self._served = served
         self.fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         self._thread: threading.Thread | None = None
@@ -60,11 +60,6 @@ class Reloader:
         self._next: list[Answer] = []
         self._held: Reread | None = None
         self._held_asked: list[Answer] = []
-
-    @property
-    def map_path(self) -> str:
-        """The map's name for people."""
-        return self._origin.path
 
     def ask(self, answer: Answer) -> None:
         """Load the catalogue in a thread; ``answer`` is called from `collect`."""
@@ -80,22 +75,22 @@ class Reloader:
         except RuntimeError as error:  # the limit of threads is reached
             self._thread = None
             self._result = ShmmapError(
-                f"{self._origin.path}: {error}", hint="raise the limit of processes (TasksMax=, ulimit -u)"
+                f"{self.origin.path}: {error}", hint="raise the limit of processes (TasksMax=, ulimit -u)"
             )
             os.eventfd_write(self.fd, 1)
 
     def _load(self, before: CatalogueView) -> None:
         try:
-            catalogue = self._origin.load(fresh=True, before=before)
+            catalogue = self.origin.load(fresh=True, before=before)
             _ = catalogue.map_version, catalogue.bounds, catalogue.mean_size  # compute here, not in the loop
             self._result = Reread(catalogue, catalogue.changes_from(before))
         except ShmmapError as error:
             self._result = error
         except OSError as error:
-            self._result = ShmmapError(f"{self._origin.path}: {error}")
+            self._result = ShmmapError(f"{self.origin.path}: {error}")
         except Exception as error:  # noqa: BLE001  else this reload and later ones would never be answered
-            log.exception("reload failed", map=self._origin.path, cause="a defect in shmmap")
-            self._result = InternalError(f"{self._origin.path}: {type(error).__name__}: {error}")
+            log.exception("reload failed", map=self.origin.path, cause="a defect in shmmap")
+            self._result = InternalError(f"{self.origin.path}: {type(error).__name__}: {error}")
         os.eventfd_write(self.fd, 1)
 
     def collect(self, apply: Apply, failed: Callable[[ShmmapError], None]) -> None:
@@ -107,7 +102,7 @@ class Reloader:
         result, asked = self._result, self._asked
         self._result, self._asked = None, []
         if isinstance(result, ShmmapError):
-            log.error("reload failed", map=self._origin.path, message=result, served="the old state")
+            log.error("reload failed", map=self.origin.path, message=result, served="the old state")
             failed(result)
             for answer in asked:
                 answer(result)

@@ -216,14 +216,22 @@ class CatalogueView(Protocol):
 
 
 class ViewOrigin(Protocol):
-    """Source of views (`shmmap.origin.catalogue.MapOrigin` implements it)."""
+    """Source of views: a map's files, a cloud, or a published map."""
 
     @property
     def path(self) -> str:
         """The map's name for people."""
 
     def load(self, *, fresh: bool = False, before: object | None = None) -> CatalogueView:
-        """Load the cells that are known now; raises the errors of `MapOrigin.load`.
+        """Load the cells that are known now.
 
-        Parts that have not changed since ``before``, an earlier view, may be shared with it.
+        ``fresh`` reads every file's stamp instead of using a cached catalogue.  Parts that have not changed
+        since ``before``, an earlier view, may be shared with it.
+
+        Raises
+        ------
+        MapMissing, MapDataError
+            The map does not exist, or cannot be served.
+        Offline
+            The map's storage cannot be reached at present.
         """

@@ -235,8 +235,7 @@ class PublishedOrigin:
             raise MapMissing(
                 f"no map is published at {self.path}", hint="shmmap publish MAP URL publishes one"
             )
-        number, root, nbytes = msgspec.structs.astuple(self._seen.current)
-        return Verified(number, root, nbytes, trust="", signed_s=0.0, expires_s=0.0)
+        return Verified(self._seen.current, trust="", signed_s=0.0, expires_s=0.0)
 
     def _verify(self) -> Verified:
         """Verify in a separate process which version is signed."""

@@ -66,23 +66,6 @@ class Page:
         return cls(number, shard, first, np.zeros(len(shard), np.uint64), nbytes, has_folders)
 
 
-class _News:
-    """An event descriptor that is closed with this object.
-
-    It is a separate object because weak references may still reach the pages while they are being deleted.
-    """
-
-    def __init__(self) -> None:
-        self.fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
-
-    def __del__(self) -> None:
-        os.close(self.fd)
-
-    def notify(self) -> None:
-        """Make the descriptor readable."""
-        os.eventfd_write(self.fd, 1)
-
-
 def _shared_out(page: Page) -> list[dict[bytes, int]]:
     """Return the indices of a page's cells by name, for each table of names."""
     tables: list[dict[bytes, int]] = [{} for _ in range(NAME_TABLES)]
@@ -196,6 +179,11 @@ class ShardPages:
     max_bytes
         Memory limit of pages; if the map has few shards, all are kept.
 
+    Attributes
+    ----------
+    fd
+        Readable when there are results.
+
     Raises
     ------
     MapDataError
@@ -224,18 +212,14 @@ class ShardPages:
             0.5 * (root.bounds[1] + root.bounds[3]),
         )
         self._absent = np.ones(len(root.keys), bool)
-        self._news = _News()
+        self.fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        weakref.finalize(self, os.close, self.fd)  # when no weak reference reaches these pages any more
         for number, shard in known.items():
             page = self._page(number, shard)
             names = _shared_out(page)
             if (twice := self._known_name(names)) is not None:
                 raise MapDataError(f"two cells are called {root.id_prefix}{twice}", cause=DAMAGED)
             self._take(page, names)
-
-    @property
-    def fd(self) -> int:
-        """Readable when there are results."""
-        return self._news.fd
 
     def __len__(self) -> int:
         return len(self.root.keys)
@@ -351,7 +335,7 @@ class ShardPages:
         """Queue an arrived shard; None: it cannot be fetched at present.  Called in a thread."""
         page = self._page(number, shard) if shard is not None else None
         self._arrived.append((number, page, _shared_out(page) if page is not None else []))
-        self._news.notify()
+        os.eventfd_write(self.fd, 1)
 
     def collect(self) -> PageNews:
         """Merge one arrived page, a tenth of a millisecond; further pages wait for later calls."""
@@ -379,7 +363,7 @@ class ShardPages:
                 self._take(page, names)
                 come.append(number)
         if self._arrived:
-            self._news.notify()
+            os.eventfd_write(self.fd, 1)
         return PageNews(come, lost)
 
     def try_again(self) -> None:

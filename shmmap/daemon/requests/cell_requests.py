@@ -529,12 +529,11 @@ class CellRequests:
     def on_session_end(self, session: Session) -> None:
         """Release the segments of a session that has ended."""
 
-        def release(resident: Resident) -> None:
-            session.drop_segment(resident)
-            self.release((resident,))
+        def release(version: int) -> None:
+            self.release(session.drop((version,)))
 
         self.on_disconnect(session)
-        self._leftovers.append(map(release, session.residents()))
+        self._leftovers.append(map(release, list(session.held)))
 
     def answer_all(self) -> None:
         """Answer all requests now: the daemon stops."""

@@ -69,9 +69,9 @@ class Handshake:
                 f" daemon {PROTOCOL_VERSION[0]}.{PROTOCOL_VERSION[1]}",
                 hint=hint,
             )
-        if (session := self.sessions.by_slot(connection.slot)) is not None:
+        if (session := self.sessions.slots.get(connection.slot)) is not None:
             return session  # a repeated hello: its answer was late or lost
-        earlier = self.sessions.by_slot(message.session)
+        earlier = self.sessions.slots.get(message.session)
         if earlier is not None and earlier.peer == connection.peer:
             self.sessions.departed.pop(earlier.slot, None)
             earlier.connect(connection)
@@ -89,7 +89,7 @@ class Handshake:
 
     def hung_up(self, connection: Connection) -> None:
         """Note that a connection has ended; its session ends once the kernel reports that it maps nothing."""
-        if (session := self.sessions.by_slot(connection.slot)) is None:
+        if (session := self.sessions.slots.get(connection.slot)) is None:
             return
         session.disconnect()
         self.cells.on_disconnect(session)

@@ -91,7 +91,7 @@ def check_queue(loads: Loads, asker: Hashable, cold: Iterable[Key]) -> None:
     Busy
         The process waits for `MAX_QUEUED` loads, and not all the cold cells are among them.
     """
-    if loads.queued_of(asker) >= MAX_QUEUED and not all(key in loads.by_key for key in cold):
+    if loads.queue.count(asker) >= MAX_QUEUED and not all(key in loads.by_key for key in cold):
         raise Busy(f"{MAX_QUEUED} loads of this process wait already", hint="wait for some of them")
 
 

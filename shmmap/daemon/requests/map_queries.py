@@ -7,6 +7,7 @@ import bisect
 import itertools
 import math
 import os
+from collections import deque
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
@@ -21,10 +22,11 @@ from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.loading.loads import Loads
-from shmmap.daemon.map.catalogue_view import CatalogueView, PageNews, Pages
+from shmmap.daemon.map.catalogue_view import Pages
 from shmmap.daemon.records import Resident
 from shmmap.daemon.requests.operators.operator_pins import OperatorPins
 from shmmap.daemon.telemetry.sampler import client_row
+from shmmap.daemon.transport.connection import Connection
 from shmmap.daemon.transport.sessions import Session, Sessions
 from shmmap.errors import BadRequest, Offline, ShmmapError, UnknownCell
 from shmmap.geometry import Area
@@ -51,7 +53,7 @@ ROW_BITS: Final = 32
 class _Waiting(NamedTuple):
     """A metadata request that waits for a page of the map."""
 
-    session: Session
+    connection: Connection
     message: messages.Metadata
     deadline_s: float
 
@@ -85,16 +87,12 @@ class MapQueries:
     event_log: EventLog
     events_path: str = ""
     _changes: _Changes | None = None
-    _waiting: list[_Waiting] = field(default_factory=list)
+    _waiting: deque[_Waiting] = field(default_factory=deque)  # the first to time out first
     _kinds: tuple[str, ...] = field(init=False, default_factory=lambda: tuple(k.describe() for k in kinds()))
-
-    @property
-    def _catalogue(self) -> CatalogueView:
-        return self.cache.catalogue
 
     def welcome(self, session: Session, message: messages.Hello) -> messages.Welcome:
         """Return the answer to a new client's hello: everything it needs to connect."""
-        cache, catalogue, (major, minor) = self.cache, self._catalogue, messages.PROTOCOL_VERSION
+        cache, catalogue, (major, minor) = self.cache, self.cache.catalogue, messages.PROTOCOL_VERSION
         ledger = cache.ledger
         return messages.Welcome(
             message.request, major, minor, daemon=build_version(), instance=self.config.instance,
@@ -126,45 +124,37 @@ class MapQueries:
         Offline
             The missing page of the map cannot be fetched at present.
         """
-        page = self.page(message)
-        if page is None and len(self._waiting) < MAX_WAITING:
-            self._waiting.append(_Waiting(session, message, now_s + METADATA_WAIT_S))
+        self._answer_or_wait(_Waiting(session.connection, message, now_s + METADATA_WAIT_S), now_s)
+
+    def _answer_or_wait(self, one: _Waiting, now_s: float) -> None:
+        page = self.page(one.message)
+        if page is None and now_s < one.deadline_s and len(self._waiting) < MAX_WAITING:
+            self._waiting.append(one)
         else:
-            session.connection.reply(encode(page or self.page(message, empty=True)))
+            one.connection.reply(encode(page or self.page(one.message, empty=True)))
 
-    def pages_finished(self, news: PageNews) -> None:
+    def pages_finished(self, now_s: float) -> None:
         """Answer requests that waited for pages which have arrived, or cannot be fetched."""
-        if self._waiting and (news.come or news.out_of_reach):
-            waiting, self._waiting = self._waiting, []
-            for one in waiting:
-                self._answer_waiting(one, over=False)
+        for _ in range(len(self._waiting)):
+            self._answer_first(now_s)
 
+    @property
     def next_deadline_s(self) -> float:
         """When the first waiting request times out; infinity if none waits."""
-        return min((one.deadline_s for one in self._waiting), default=math.inf)
+        return self._waiting[0].deadline_s if self._waiting else math.inf
 
     def answer_overdue(self, now_s: float) -> None:
         """Answer requests that have timed out: clients repeat them."""
-        waiting, self._waiting = self._waiting, []
-        for one in waiting:
-            if now_s < one.deadline_s:
-                self._waiting.append(one)
-            else:
-                self._answer_waiting(one, over=True)
+        while self._waiting and now_s >= self._waiting[0].deadline_s:
+            self._answer_first(now_s)
 
-    def _answer_waiting(self, one: _Waiting, *, over: bool) -> None:
-        connection = one.session.connection
-        if not one.session.is_connected:
-            return
+    def _answer_first(self, now_s: float) -> None:
+        """Answer the first of the waiting requests, or let it wait behind the others."""
+        one = self._waiting.popleft()
         try:
-            page = self.page(one.message)
+            self._answer_or_wait(one, now_s)
         except ShmmapError as error:
-            connection.refuse(one.message.request, error)
-            return
-        if page is None and not over:
-            self._waiting.append(one)
-        else:
-            connection.reply(encode(page or self.page(one.message, empty=True)))
+            one.connection.refuse(one.message.request, error)
 
     def page(self, message: messages.Metadata, *, empty: bool = False) -> messages.MetadataPage | None:
         """Return a metadata page; if a page of the map is missing, None, or a page without rows if ``empty``.
@@ -174,7 +164,7 @@ class MapQueries:
         Offline
             The missing page of the map cannot be fetched at present.
         """
-        catalogue = self._catalogue
+        catalogue = self.cache.catalogue
         removed: tuple[str, ...] = ()
         start, limit = max(0, message.start), max(1, min(message.limit, PAGE_ROWS))
         area = messages.area_from_message(message.area) if message.area is not None else None
@@ -200,7 +190,7 @@ class MapQueries:
         self, touched: NDArray[np.intp], area: Area | None, start: int, limit: int
     ) -> tuple[Sequence[int], int | None] | None:
         """Return changed cells from position ``start``, and the next position; None if pages are missing."""
-        catalogue = self._catalogue
+        catalogue = self.cache.catalogue
         if (pages := catalogue.pages) is not None:
             page_of = pages.of_cell
             if not self._have_come(pages, sorted({page_of(index) for index in touched.tolist()})):
@@ -230,7 +220,7 @@ class MapQueries:
 
         Only some cells of a large area are tested: a page may have few rows or none without being the last.
         """
-        catalogue = self._catalogue
+        catalogue = self.cache.catalogue
         count = len(catalogue)
         if area is None:
             end = min(start + limit, count)
@@ -267,7 +257,7 @@ class MapQueries:
         cells = pages.cells(page)
         indices = np.arange(cells.start, cells.stop)
         if area is not None:
-            indices = indices[touches(area, self._catalogue.boxes_of(indices))]
+            indices = indices[touches(area, self.cache.catalogue.boxes_of(indices))]
         indices = indices[indices.searchsorted(cells.start + row * (page == number)) :]
         if len(indices) > limit:
             return indices[:limit].tolist(), page << ROW_BITS | int(indices[limit]) - cells.start
@@ -275,20 +265,20 @@ class MapQueries:
 
     def _changes_since(self, map_version: int) -> _Changes | None:
         """Return the changes, cached for the following pages; None if they are not known."""
-        between = map_version, self._catalogue.map_version
+        between = map_version, self.cache.catalogue.map_version
         if self._changes is None or self._changes.between != between:
             change = self.map_switch.changes_since(map_version)
             if change is None:
                 return None
             touched = {i for cell in change[0] if (i := self.cache.index_of(cell)) is not None}
-            if len(touched) < len(change[0]) and not self._catalogue.complete:
+            if len(touched) < len(change[0]) and not self.cache.catalogue.complete:
                 return None  # pages that listed some of them have been dropped
             removed = tuple(map(self.cache.wire_id, change[1]))
             self._changes = _Changes(between, np.array(sorted(touched), dtype=np.intp), removed)
         return self._changes
 
     def _row(self, index: int) -> messages.MetadataRow:
-        catalogue, known = self._catalogue, self.cache.heights
+        catalogue, known = self.cache.catalogue, self.cache.heights
         heights = known.get(index) or (None, None)
         wire_id, size = self.cache.wire_id(catalogue.id(index)), catalogue.source_bytes(index)
         return messages.MetadataRow(wire_id, catalogue.version(index), *catalogue.box(index), size, *heights)
@@ -298,11 +288,11 @@ class MapQueries:
         statistics, rows = self.cache.statistics, list[messages.ClientRow]()
         for one in tuple(self.sessions):
             yield
-            rows.append(_with_share(client_row(one), usage.shares.get(one.slot, Share())))
+            rows.append(client_row(one, usage.shares.get(one.slot, Share())))
         return messages.StatsReply(
             message.request,
             self.cache.epoch,
-            self._catalogue.map_version,
+            self.cache.catalogue.map_version,
             dict(statistics.values),
             tuple(rows),
             usage.unknown,
@@ -310,7 +300,12 @@ class MapQueries:
         )
 
     def _show(self, message: messages.Show) -> messages.ShownCell:
-        cache, catalogue, ledger, heights = self.cache, self._catalogue, self.cache.ledger, self.cache.heights
+        cache, catalogue, ledger, heights = (
+            self.cache,
+            self.cache.catalogue,
+            self.cache.ledger,
+            self.cache.heights,
+        )
         index = cache.index_of(message.id)
         # a cell that left the map is still shown while a process maps it, with version 0
         ids = {message.id, cache.id_prefix + message.id} if index is None else {catalogue.id(index)}
@@ -356,12 +351,3 @@ class MapQueries:
             resident.box, resident.hits, int(resident.last_use_s * 1e9), resident.load_ns,
             ahead=resident.prefetched and state == "resident",
         )  # fmt: skip
-
-
-def _with_share(row: messages.ClientRow, share: Share) -> messages.ClientRow:
-    return replace(
-        row,
-        mapped_bytes=share.mapped_bytes,
-        superseded=share.superseded,
-        superseded_bytes=share.superseded_bytes,
-    )

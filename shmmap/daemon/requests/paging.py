@@ -108,7 +108,8 @@ class Paging:
                 self.map_switch.recheck()
         self.cells.pages_finished(news)
         self.scheduler.pages_finished()
-        self.queries.pages_finished(news)
+        if news.come or news.out_of_reach:
+            self.queries.pages_finished(time.monotonic())
 
     # --- a background task of the loop ------------------------------------------------------------
 
@@ -121,7 +122,7 @@ class Paging:
         spare = pages.spare() is not None
         drop_s = self._rests_until_s if spare else math.inf
         fills = not spare and len(self.sessions) and not self.cache.catalogue.complete
-        return min(drop_s, self.queries.next_deadline_s(), self._fill_s if fills else math.inf)
+        return min(drop_s, self.queries.next_deadline_s, self._fill_s if fills else math.inf)
 
     def run_step(self, now_s: float) -> None:
         """Drop one page if there are too many and nothing needs it, or fetch one if the link is idle."""

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
-from shmmap.daemon.cache.holders import Survey
+from shmmap.daemon.cache.holders import Share, Survey
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.transport.sessions import Session, Sessions
@@ -82,8 +82,8 @@ class RecentCounts:
         return self._samples[max(0, found - 1)][1]
 
 
-def client_row(session: Session) -> ClientRow:
-    """Return the row of a client for operators."""
+def client_row(session: Session, share: Share) -> ClientRow:
+    """Return the row of a client, and of what it maps, for operators."""
     intent, peer = session.intent, session.peer
     return ClientRow(
         session.slot,
@@ -99,6 +99,9 @@ def client_row(session: Session) -> ClientRow:
         (float(intent.x), float(intent.y)) if intent is not None else None,
         None if intent is None or intent.heading is None else float(intent.heading),
         _window(session.area) if session.area is not None else None,
+        share.mapped_bytes,
+        share.superseded,
+        share.superseded_bytes,
     )
 
 

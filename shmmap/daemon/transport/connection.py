@@ -63,6 +63,13 @@ class Peer:
     pid: int = 0
 
 
+def peer_of(connected: Socket) -> Peer:
+    """Return the process at the other end of a Unix socket, as the kernel reports it."""
+    credentials = connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+    pid, uid, gid = _CREDENTIALS.unpack(credentials)
+    return Peer(uid, gid, pid)
+
+
 class Connection:
     """A connected Unix socket on which a client speaks ZMTP.
 
@@ -81,10 +88,7 @@ class Connection:
     """
 
     def __init__(self, connected: Socket, listener: Listener) -> None:
-        # as reported by the kernel
-        credentials = connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
-        pid, uid, gid = _CREDENTIALS.unpack(credentials)
-        self.peer = Peer(uid, gid, pid)
+        self.peer = peer_of(connected)
         self.open = True
         self.slot = 0
         self.unsent_bytes = 0

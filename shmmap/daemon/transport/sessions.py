@@ -78,11 +78,6 @@ class Session:
         self.motion = Motion()
         self.sessions.moved[self] = None
 
-    @property
-    def is_connected(self) -> bool:
-        """Whether its connection still belongs to the session, closed or not."""
-        return self.connection.slot == self.slot
-
     def state_intent(self, intent: Intent) -> None:
         """Take over the position and route that the client states."""
         self.intent = self.new_intent = intent
@@ -114,13 +109,13 @@ class Session:
             self.exclusive_bytes += one * resident.nbytes
         elif len(others) == 1:
             (slot,) = others
-            other = self.sessions.by_slot(slot)
+            other = self.sessions.slots.get(slot)
             if other is not None:
                 other.exclusive_bytes -= one * resident.nbytes
 
     def _lose(self, resident: Resident) -> None:
         self.held_bytes -= resident.nbytes
-        later = self.sessions.by_slot(self.slot)
+        later = self.sessions.slots.get(self.slot)
         if later is None or later is self or resident not in later.held.get(resident.version, ()):
             resident.sessions.discard(self.slot)
             self._share(resident, -1)
@@ -140,10 +135,6 @@ class Session:
             self._lose(resident)
             if not known:
                 del self.held[resident.version]
-
-    def residents(self) -> list[Resident]:
-        """Return all segments that the session holds."""
-        return [resident for known in self.held.values() for resident in known]
 
     def as_holder(self, nbytes: int, cells: int) -> Holder:
         """Return this session as a row of a reply."""
@@ -170,7 +161,7 @@ class Sessions:
     Attributes
     ----------
     slots : dict
-        Sessions by slot.
+        Sessions by slot, the offset of their lock byte.
     departed : dict
         By slot, sessions whose connection has ended and whose process may still map segments it was given.
     moved : dict
@@ -192,10 +183,6 @@ class Sessions:
 
     def __iter__(self) -> Iterator[Session]:
         return iter(self.slots.values())
-
-    def by_slot(self, slot: int) -> Session | None:
-        """Return the session whose lock byte is at offset ``slot``."""
-        return self.slots.get(slot)
 
     def largest_holder(self) -> str:
         """Return name, process and bytes of the client that was given most; empty if none was given any."""

@@ -4,20 +4,18 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import os
 import socket
 import stat
-import struct
 from pathlib import Path
 from typing import Final
 
+from shmmap.daemon.transport.connection import peer_of
 from shmmap.errors import InstanceBusy
 from shmmap.logfmt import escaped
 from shmmap.segment.names import name_taken
 
 _OTHERWISE: Final = "choose another --endpoint"
-_CREDENTIALS: Final = struct.Struct("iII")  # struct ucred: pid, uid, gid
 
 
 class SocketFile:
@@ -126,21 +124,17 @@ def _listen(path: str, gid: int) -> socket.socket:
 
 def _answers(path: str) -> int | None:
     """Return the process that has the socket at ``path`` open, 0 if it is not known; None if none has."""
-    for kind in (socket.SOCK_STREAM, socket.SOCK_SEQPACKET, socket.SOCK_DGRAM):
-        with socket.socket(socket.AF_UNIX, kind | socket.SOCK_NONBLOCK) as probe:
-            try:
-                probe.connect(path)
-                credentials = probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
-                pid = _CREDENTIALS.unpack(credentials)[0]
-                return pid if pid > 0 and os.path.exists(f"/proc/{pid}") else _owner(path)
-            except FileNotFoundError:
-                return None
-            except ConnectionRefusedError:  # a leftover, unless a process has bound it and is about to listen
-                return _owner(path) or None
-            except OSError as error:
-                if error.errno != errno.EPROTOTYPE:  # EPROTOTYPE: another type of socket
-                    return _owner(path)
-    return _owner(path)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK) as probe:
+        try:
+            probe.connect(path)
+            pid = peer_of(probe).pid
+            return pid if pid > 0 and os.path.exists(f"/proc/{pid}") else _owner(path)
+        except FileNotFoundError:
+            return None
+        except ConnectionRefusedError:  # a leftover, unless a process has bound it and is about to listen
+            return _owner(path) or None
+        except OSError:  # for example, a process has bound another type of socket
+            return _owner(path)
 
 
 def _owner(path: str) -> int:

@@ -64,6 +64,11 @@ class ObjectTier:
     quiet
         Log only that the disk is full, which other processes of the same daemon may not notice; they log the
         rest.
+
+    Attributes
+    ----------
+    damaged_objects : int
+        Number of objects that were damaged and therefore removed.
     """
 
     def __init__(self, cache_dir: str, *, limit_bytes: int, quiet: bool = False) -> None:
@@ -75,12 +80,7 @@ class ObjectTier:
         self._trimmer: threading.Thread | None = None
         self._trim_again = False
         self._said_s: dict[str, float] = {}
-        self._damaged = 0
-
-    @property
-    def damaged_objects(self) -> int:
-        """Number of objects that were damaged and therefore removed."""
-        return self._damaged
+        self.damaged_objects = 0
 
     @property
     def problem(self) -> str:
@@ -111,7 +111,7 @@ class ObjectTier:
                 if len(data) == nbytes and sha256(data).digest() == digest:
                     return data
                 with self._lock:
-                    self._damaged += 1
+                    self.damaged_objects += 1
                 os.unlink(path, dir_fd=place)
         except OSError as error:
             self._say(error)
@@ -300,17 +300,12 @@ class KeptObjects:
     def __init__(
         self, store: ObjectReader, tier: ObjectTier | None, *, is_index: bool = False, keep: bool = True
     ) -> None:
-        self._store = store
+        self._store, self.url = store, store.url
         self._tier = tier
         self._is_index = is_index
         self._keep = keep
         self._lock = threading.Lock()
         self._counts = ObjectCounts()
-
-    @property
-    def url(self) -> str:
-        """URL or path of the store."""
-        return self._store.url
 
     @property
     def counts(self) -> ObjectCounts:

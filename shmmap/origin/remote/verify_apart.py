@@ -50,8 +50,8 @@ class Verified(msgspec.Struct, frozen=True):
 
     Attributes
     ----------
-    version, root, bytes
-        As in ``CURRENT``.
+    current
+        Content of ``CURRENT`` for this version.
     trust
         SHA-256 of the trusted root, in hex.
     signed_s, expires_s
@@ -59,17 +59,10 @@ class Verified(msgspec.Struct, frozen=True):
         time.
     """
 
-    version: int
-    root: str
-    bytes: int
+    current: Current
     trust: str
     signed_s: float
     expires_s: float
-
-    @property
-    def current(self) -> Current:
-        """Content of ``CURRENT`` for this version."""
-        return Current(self.version, self.root, self.bytes)
 
 
 class VerifyReply(msgspec.Struct):

@@ -85,14 +85,7 @@ def verify_version(store: Store, trusted: bytes, state_dir: str, trust: str = ""
         raise _expired(
             store, role, expires[role], f"the timestamp was signed on {format_utc(signed_s)}, and "
         )
-    return Verified(
-        current.version,
-        current.root,
-        current.bytes,
-        sha256(trusted).hexdigest(),
-        signed_s,
-        expires[role].timestamp(),
-    )
+    return Verified(current, sha256(trusted).hexdigest(), signed_s, expires[role].timestamp())
 
 
 def _updater(store: Store, trusted: bytes, memory: str, trust: str) -> tuple[Updater, _Asked]:

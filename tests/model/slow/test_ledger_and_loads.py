@@ -143,7 +143,7 @@ class Machine(RuleBasedStateMachine):
     @rule()
     def start_next(self) -> None:
         queued = [w for w in self.loads.values() if not w.running]
-        load = self.queue.choose()
+        load = self.queue.queue.choose()
         if not queued:
             assert load is None
             return
@@ -435,16 +435,17 @@ class Machine(RuleBasedStateMachine):
     @invariant()
     def sessions_hold_what_exists(self) -> None:
         for session in self.clients:
-            held = session.residents()
+            held = [resident for known in session.held.values() for resident in known]
             assert session.held_bytes == sum(resident.nbytes for resident in held)
             for resident in held:
                 assert resident.name in self.segments
                 assert session.slot in resident.sessions
         for segment in self.segments.values():
             for slot in self.objects[segment.name].sessions:
-                holder = self.sessions.by_slot(slot)
+                holder = self.sessions.slots.get(slot)
                 assert isinstance(holder, Session)
-                assert self.objects[segment.name] in holder.residents()
+                resident = self.objects[segment.name]
+                assert resident in holder.held[resident.version]
 
     def teardown(self) -> None:
         """Once nothing is mapped or waited for, all memory can be had back."""

@@ -141,7 +141,7 @@ def test_eviction(whole: Callable[..., WholeDaemon], tmp_path: Path) -> None:
     one = whole(made.root, budget_bytes=4 << 20)
     everything = [cell.id for cell in one.ask(m.Metadata(2)).rows]
     held: list[str] = []
-    asking, sweeping = Walker(under="refusal"), Walker(under="sweep")
+    asking, sweeping = Walker(under="why_not"), Walker(under="sweep")
     for number, cell in enumerate(everything):
         one.send(m.Selected(10 + number, (cell,), wait=30.0))
         with asking.walking():

@@ -16,7 +16,8 @@ from shmmap.lazy_imports import TO_SIGN, needed_packages
 
 if TYPE_CHECKING:
     from shmmap.cli import json_output
-    from shmmap.origin.catalogue import MapOrigin
+    from shmmap.dividing.served_cloud import DividedCloud
+    from shmmap.origin.map_directory import MapDirectory
     from shmmap.origin.remote.store import Store
     from shmmap.origin.remote.verify_apart import Verified
     from shmmap.prepare.run import Failure
@@ -48,7 +49,7 @@ def refuse_map_options(args: argparse.Namespace, what: str, others: Sequence[str
             raise BadRequest(f"--{option.replace('_', '-')} does not go with {what}")
 
 
-def origin_at(args: argparse.Namespace, cache_dir: str) -> MapOrigin:
+def origin_at(args: argparse.Namespace, cache_dir: str) -> MapDirectory | DividedCloud:
     """Open the map at ``args.map_path`` with the options for reading it."""
     from shmmap.dividing.served_cloud import find_origin
 

@@ -145,7 +145,7 @@ class OperatorRequests:
         for asked, (session, until_s) in list(self._reloading.items()):
             if now_s >= until_s:
                 del self._reloading[asked]
-                why = f"{self.reloader.map_path}: not read within {RELOAD_S:g} s; the reload goes on"
+                why = f"{self.reloader.origin.path}: not read within {RELOAD_S:g} s; the reload goes on"
                 session.connection.refuse(asked[1], Offline(why))
 
     def _reload(self, session: Session, message: messages.Reload, now_s: float) -> None:

@@ -229,7 +229,7 @@ def test_a_demand_takes_over_what_was_loaded_ahead(loads: Loads, runs: bool) -> 
     if not runs:
         assert loads.spare(KEY, 100, "a", computed=False) is wish
         assert (wish.work, wish.is_ahead) == (Purpose.SPARE, True)
-    elif loads.choose() is wish:
+    elif loads.queue.choose() is wish:
         assert loads.start(wish, Attempt(0.0))
     assert loads.want(KEY, 100, 3.0, "b") is wish
     assert (wish.work, wish.is_ahead, wish.is_running) == (Purpose.DEMAND, False, runs)
@@ -259,7 +259,7 @@ def test_a_leftover_that_is_found_late_is_checked_instead_of_loaded(
     """A page of the map had to come first; a load that runs already supersedes it."""
     load = loads.prefetch(KEY, 100, 5.0, computed=False) if is_wish else loads.want(KEY, 100, 3.0, "a")
     before = load.work
-    if runs and loads.choose() is load:
+    if runs and loads.queue.choose() is load:
         assert loads.start(load, Attempt(0.0))
     resident = leftover()
     loads.check_leftover(resident)

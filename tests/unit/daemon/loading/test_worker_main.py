@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import resource
 import signal
@@ -20,7 +21,8 @@ import numpy as np
 import pytest
 
 import shmmap
-from shmmap.daemon.loading import worker_messages
+from shmmap.daemon.loading import parent_main, worker_messages
+from shmmap.daemon.loading.worker_main import WorkerSettings
 from shmmap.processes.start_child import MAX_PACKET_BYTES
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.header import PublishBlock
@@ -98,6 +100,8 @@ class Loader:
         data, fds, _, _ = socket.recv_fds(self.channel, MAX_PACKET_BYTES, 1)
         assert data, "the loader closed its channel"
         message = worker_messages.decode_from_worker(data)
+        if isinstance(message, worker_messages.Compiling):  # once on a machine
+            return self.receive()
         assert bool(fds) is isinstance(message, worker_messages.Ready)
         if isinstance(message, worker_messages.Failed):
             os.close(self.segments.pop(message.number))
@@ -403,6 +407,23 @@ def test_a_loader_that_cannot_be_watched_is_none(parent: Parent) -> None:
     assert said[-1] == worker_messages.Ended(-1, "pidfd_open: Too many open files")
     resource.prlimit(pid, resource.RLIMIT_NOFILE, limits)
     assert parent.fork().end() == 0
+
+
+def test_a_parent_that_cannot_compile_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """There is no process left for the child that compiles kernels: loaders do it."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    monkeypatch.setattr(parent_main, "compiled_mark", lambda: tmp_path / "none")
+    forks: list[int] = []
+
+    def no_process() -> int:
+        forks.append(os.getpid())
+        raise BlockingIOError(errno.EAGAIN, "none left")
+
+    monkeypatch.setattr(os, "fork", no_process)
+    with theirs:
+        ours.close()
+        parent_main._Parent(theirs, WorkerSettings(str(tmp_path))).run()
+    assert len(forks) == 1
 
 
 def test_a_layer_is_made_of_points_in_memory_while_they_are_of_the_file_s_state(

@@ -88,19 +88,19 @@ def test_nearest_cells_first(inner: Inner, small_map: DividedMap) -> None:
     session = one.session()
     with one.loaders_standing_still():
         one.ask(session, Area(1, EVERYWHERE))
-        nearest = one.loads.choose()
+        nearest = one.loads.queue.choose()
     assert nearest is not None
     assert Path(nearest.key.cell_id).name == "-20_-20.pcd"  # of the four that touch the middle
     two = inner(small_map.root)
     two.ask(two.session(), Area(1, CircleMessage(35, 35, 300)))
-    nearest = two.loads.choose()
+    nearest = two.loads.queue.choose()
     assert nearest is not None
     assert Path(nearest.key.cell_id).name == "20_20.pcd"
     two = inner(small_map.root)
     session = two.session()
     session.intent, session.says_where = Intent(-35.0, 35.0), True
     two.ask(session, Area(1, CircleMessage(35, 35, 300)))
-    nearest = two.loads.choose()
+    nearest = two.loads.queue.choose()
     assert nearest is not None
     assert Path(nearest.key.cell_id).name == "-40_20.pcd"
 
@@ -304,7 +304,7 @@ def test_a_few_looks_a_request(many: InnerDaemon, monkeypatch: pytest.MonkeyPatc
     )
     assert many.statistics.values["refused_quota"] == 0
     assert 10 <= looks < 50
-    assert {r.key.cell_id for r in session.residents()} >= set(ids(many, 30, 60))
+    assert {r.key.cell_id for held in session.held.values() for r in held} >= set(ids(many, 30, 60))
 
 
 def test_the_next_request_looks_at_others(many: InnerDaemon, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -369,7 +369,7 @@ def test_handles_are_encoded_once(warm: tuple[InnerDaemon, Cells]) -> None:
     session = inner.session()
     inner.ask(session, Differential(2, EVERYWHERE))
     (_, first), *_ = [reply for reply in inner.replies if reply[1].request == 2]
-    residents = session.residents()
+    residents = [resident for held in session.held.values() for resident in held]
     assert len(residents) == len(first.cells) == len(everything.cells)
     for resident in residents:  # marked, so that it shows whose bytes they are
         handle = next(cell for cell in first.cells if cell.version == resident.version)

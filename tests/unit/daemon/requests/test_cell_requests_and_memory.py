@@ -86,7 +86,7 @@ def test_looking_for_room_where_others_map_everything_comes_to_an_end(
             while one.evictor.free(1 << 30, one.now_s()) is not Freeing.NO_MORE:
                 looks += 1
                 assert looks < 10
-                one.scheduler.room.on_closes(one.now_s())
+                one.scheduler.room.on_report(lambda: one.cache.reclaimer.on_closes(one.now_s()))
 
 
 def test_what_is_mapped_and_asked_for_repeatedly_is_no_reason_to_wait(
@@ -143,7 +143,7 @@ def test_room_is_made_for_several_loads_at_once(
     given_up = -(-(estimate + min(7 * estimate, budget // AHEAD_SHARE)) // each)
     assert one.ledger.unopened_bytes == given_up * each > 2 * estimate
     with monkeypatch.context() as patch:
-        patch.setattr(Room, "refusal", lambda *_: pytest.fail("nothing has changed"))
+        patch.setattr(Room, "why_not", lambda *_: pytest.fail("nothing has changed"))
         for _ in range(50):
             one.turn(0.0)
     one.stopped_at_s = None
