@@ -121,15 +121,13 @@ class _OpeningMap:
 
 def _open_files(settings: LiveSettings) -> tuple[Folder, MapDatabase]:
     """Open a map's directory and read it; a new run of the map begins."""
-    with contextlib.ExitStack() as undo:
-        folder = Folder(settings.path)
-        undo.callback(folder.close)
+    folder = Folder(settings.path)
+    try:
         fixed = MapSettings(settings.resolution, settings.occupancy, settings.frame_id)
-        database = MapDatabase(folder, fixed)
-        undo.callback(database.close)
-        database.begin_run()
-        undo.pop_all()
-    return folder, database
+        return folder, MapDatabase(folder, fixed)
+    except BaseException:
+        folder.close()
+        raise
 
 
 def _reason(error: BaseException) -> str:

@@ -198,7 +198,7 @@ class PagedMap:
         self._writer = ChunkWriter(database.settings.occupancy, self._undo)
         self._threads = FileThreads(wake)
         self._parts: dict[Scan, _Part] = {}
-        self._generation = database.begin_run() << 32
+        self._generation = database.record.runs << 32
         self._look_s = 0.0
         self._end_s: float | None = None
         for key, row in database.rows.items():
@@ -404,7 +404,7 @@ class PagedMap:
         more = memory_bytes(bricks) - chunk.nbytes
         if more > 0 and not self.residency.may_grow(chunk, more):
             return
-        known = {mapper.number for mapper in self.database.mappers}
+        known = {mapper.number for mapper in self.database.record.mappers}
         try:
             self._writer.apply(
                 file.view,
@@ -533,7 +533,7 @@ class PagedMap:
 
     def _finish(self, applied: dict[int, int] | None) -> None:
         self.database.write_record(applied)
-        self.database.finish()
+        self.database.bring_log_in()
 
     def remove_from_memory(self) -> None:
         """Evict all chunks."""
