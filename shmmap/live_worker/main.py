@@ -335,7 +335,7 @@ class _Worker:
 
     def _may_end(self, ending: messages.End, now_s: float) -> bool:
         """Return whether all is saved, or saving has made no progress for a while."""
-        left = [one for one in self._maps.values() if not one.is_saved]
+        left = [one for one in self._maps.values() if not one.paged.all_durable]
         return ending.keep or all(now_s > max(one.paged.saved_s, self._ending_s) + HOPELESS_S for one in left)
 
     def end(self, ending: messages.End) -> tuple[messages.Unsaved, ...]:
