@@ -29,15 +29,23 @@ def numbers(text: str, names: str) -> list[float]:
     return values
 
 
-def seconds(text: str) -> float:
-    """Parse a duration in seconds: not negative, and no longer than a thread can wait."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not (0.0 <= value <= TIMEOUT_MAX):
-        raise argparse.ArgumentTypeError(f"expected seconds, not {text!r}")
-    return value
+def number_of(what: str, lowest: float = -math.inf, highest: float = math.inf) -> Callable[[str], float]:
+    """Return an argparse type for numbers within these bounds; a message says that ``what`` is expected."""
+
+    def parse(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not lowest <= value <= highest:
+            raise argparse.ArgumentTypeError(f"expected {what}, not {text!r}")
+        return value
+
+    return parse
+
+
+seconds = number_of("seconds", 0.0, TIMEOUT_MAX)  # a thread cannot wait longer
+metres = number_of("metres")
 
 
 def at_least(lowest: int) -> Callable[[str], int]:

@@ -248,7 +248,8 @@ def _outlive_full_stderr() -> None:
 
 def _drop_output(stream: TextIO | None = None) -> None:
     """Discard what stdout, or another stream, buffers or gets, since the interpreter flushes it at exit."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), (stream or sys.stdout).fileno())
+    with open(os.devnull, "wb") as null:
+        os.dup2(null.fileno(), (stream or sys.stdout).fileno())
 
 
 def complain(name: str, message: str, hint: str = "") -> None:

@@ -56,8 +56,8 @@ def timeout_s(what: str, value: float) -> float:
     return given
 
 
-def checked_seconds(what: str, seconds: object) -> float:
-    """Return a checked wait in seconds; 0 is allowed.
+def checked_seconds(seconds: object) -> float:
+    """Return a checked ``timeout_s``; 0 is allowed.
 
     Raises
     ------
@@ -65,7 +65,7 @@ def checked_seconds(what: str, seconds: object) -> float:
         The value is no number, is negative, or is longer than Python can wait.
     """
     if not isinstance(seconds, numbers.Real) or not 0 <= float(seconds) <= TIMEOUT_MAX:  # nor NaN
-        raise BadRequest(f"{what} must be a number of seconds, 0 or more, not {seconds!r}")
+        raise BadRequest(f"timeout_s must be a number of seconds, 0 or more, not {seconds!r}")
     return float(seconds)
 
 

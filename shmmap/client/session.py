@@ -188,11 +188,15 @@ class Session:
         reply: R = self._reply(Asked(make, kind, all_s, quiet_s))
         return reply
 
-    def _reply(self, asked: Asked) -> Any:
+    def _next_request(self, asked: Asked) -> tuple[Connection, messages.Request]:
+        """Return the connection and a message for it; what was unmapped since is reported before it."""
         connection = self._connected()
         if self.attacher.has_unmapped and not self._attaching.locked():
             self._report_unmapped(connection)
-        message = asked.make(connection.new_request())
+        return connection, asked.make(connection.new_request())
+
+    def _reply(self, asked: Asked) -> Any:
+        connection, message = self._next_request(asked)
         return connection.ask(message, asked.kind, timeout_s=asked.timeout_s, quiet_s=asked.quiet_s)
 
     def run(self, steps: Steps[R]) -> R:
@@ -207,10 +211,7 @@ class Session:
 
     def begin(self, asked: Asked, answers: Answers, for_whom: object) -> Callable[[], None]:
         """Send a request whose reply goes to ``answers``; return what withdraws it."""
-        connection = self._connected()
-        if self.attacher.has_unmapped and not self._attaching.locked():
-            self._report_unmapped(connection)
-        message = asked.make(connection.new_request())
+        connection, message = self._next_request(asked)
         connection.begin(
             message, answers, timeout_s=asked.timeout_s, quiet_s=asked.quiet_s, for_whom=for_whom
         )

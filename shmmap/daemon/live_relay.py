@@ -536,7 +536,7 @@ class LiveRelay:
                     reason=one.problem or "there was no time left",
                 )
         elif ended is None and was_serving:
-            unsaved = {row.name: row.dirty + row.saving for row in self._rows if row.dirty + row.saving}
+            unsaved = {row.name: row.unsaved for row in self._rows if row.unsaved}
             self.unsaved = {} if keep else unsaved
             log.error("live worker did not end in time: what is in memory stays there for the next start")
         self._forget()

@@ -16,11 +16,12 @@ from collections import Counter
 from itertools import islice
 from typing import Any, Final
 
-from shmmap.daemon.prerequisites import account_name
+from shmmap.daemon.prerequisites import account_name, group_id
 from shmmap.doctor.daemon_lists import ANSWER_S
 from shmmap.doctor.diagnosis import Diagnosis
 from shmmap.doctor.verdicts import Finding, fail, ok, outage_so_far, skip, warn
 from shmmap.errors import (
+    ConfigError,
     DaemonUnreachable,
     NoAnswer,
     NoSocket,
@@ -58,16 +59,11 @@ def groups_of(uid: int) -> set[int]:
 def check_group(diagnosis: Diagnosis) -> Finding:
     """Check that this account is a member of the group that may connect."""
     gid = -1
-    if diagnosis.config.group.isdigit():
-        gid = int(diagnosis.config.group)
-    elif diagnosis.config.group:
+    if diagnosis.config.group:
         try:
-            gid = grp.getgrnam(diagnosis.config.group).gr_gid
-        except KeyError:
-            return fail(
-                f"there is no group {diagnosis.config.group!r}",
-                f"groupadd --system {diagnosis.config.group}",
-            )
+            gid = group_id(diagnosis.config.group, "group")
+        except ConfigError as error:
+            return fail(error.message, error.hint)
     else:
         try:
             status = os.stat(diagnosis.socket)

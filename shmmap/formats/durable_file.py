@@ -32,7 +32,8 @@ def appearing_file(path: str | os.PathLike[str], *, replace: bool = True) -> Ite
     Parameters
     ----------
     path
-        Final name; until the end the file has a temporary name in the same directory.
+        Final name.  Until the end the file has none, so a kill leaves nothing; or a temporary one in the same
+        directory, where the file system (NFS) needs that.
     replace
         Whether the file may replace an existing one.
 
@@ -48,10 +49,13 @@ def appearing_file(path: str | os.PathLike[str], *, replace: bool = True) -> Ite
     refuse_planted(directory or ".")
     interim = os.path.join(directory, f".{name}.{secrets.token_hex(4)}.tmp")
     try:
-        with open(interim, "xb") as file:
+        with _opened(directory or ".", interim) as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
+            if not os.fstat(file.fileno()).st_nlink:  # no call gives it a name and replaces another's at once
+                # with a descriptor, though none is needed, Python has the path in /proc followed
+                os.link(f"/proc/self/fd/{file.fileno()}", interim, src_dir_fd=file.fileno())
         if replace:
             os.replace(interim, path)
         else:
@@ -60,10 +64,17 @@ def appearing_file(path: str | os.PathLike[str], *, replace: bool = True) -> Ite
     except BaseException as error:
         with contextlib.suppress(OSError):
             os.unlink(interim)
-        if isinstance(error, OSError) and error.filename == interim:
+        if isinstance(error, OSError) and interim in (error.filename, error.filename2):
             error.filename = os.fspath(path)  # the name that the caller knows
         raise
     flush_directory(directory or ".")
+
+
+def _opened(directory: str, interim: str) -> IO[bytes]:
+    """Open a new file without a name, or with this one where files must have one."""
+    with contextlib.suppress(OSError):
+        return open(os.open(directory, os.O_TMPFILE | os.O_WRONLY | os.O_CLOEXEC, 0o666), "wb")
+    return open(interim, "xb")
 
 
 @contextlib.contextmanager

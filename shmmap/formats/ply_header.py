@@ -18,7 +18,7 @@ from shmmap.columns import column_names
 from shmmap.errors import BadRequest, MapDataError
 from shmmap.formats.coordinate_system import CoordinateSystem
 from shmmap.formats.pcd.fields import AXES, MAX_FIELDS, PcdField
-from shmmap.formats.source_file import refusal
+from shmmap.formats.source_file import refusal, refuse_no_data
 from shmmap.formats.stated_units import decoded, scale_notes, system_of_comments
 
 HEADER_LIMIT_BYTES: Final = 1 << 20
@@ -124,8 +124,7 @@ def parse_ply_header(head: bytes, *, path: str, file_bytes: int) -> PlyHeader:
         ``empty_file``, ``bad_header``, ``bad_type``, ``no_xyz``, ``unknown_encoding``, ``too_many_points``
         or ``truncated``, with the byte offset of what is wrong.
     """
-    if not head:
-        raise refusal("empty_file", "the file is empty (0 bytes)", path=path, offset=0)
+    refuse_no_data(head, path)
     return _Parser(head, path, file_bytes).parse()
 
 
@@ -180,16 +179,6 @@ class _Parser:
         if self.head[start : start + 3] == b"ply" and self.head[end : end + 1] in (b"\n", b"\r"):
             bare_cr = self.head[end : end + 1] == b"\r" and self.head[end + 1 : end + 2] != b"\n"
             return end + (1 if bare_cr or self.head[end : end + 1] == b"\n" else 2), bare_cr
-        if not self.head.strip(b"\0"):
-            raise self._error("nothing but zero bytes", "zero_filled", at=0)
-        if self.head.startswith(b"version https://git-lfs"):
-            raise refusal(
-                "lfs_pointer",
-                "a git-lfs pointer instead of the data",
-                path=self.path,
-                offset=0,
-                hint="run git lfs pull",
-            )
         raise self._error("not a PLY file: it does not start with the line 'ply'", at=0)
 
     def _lines(self, at: int, newline: bytes) -> int:

@@ -20,6 +20,8 @@ from shmmap.errors import MapDataError
 
 _Self = TypeVar("_Self", bound="FileReader")
 
+_LFS: Final = b"version https://git-lfs"
+
 
 def open_regular(path: str) -> int:
     """Open a regular file for reading; return its descriptor.
@@ -197,3 +199,20 @@ def refusal(
     if cause not in CAUSES:
         raise KeyError(cause)
     return MapDataError(message, path=path, offset=offset, cause=cause, hint=hint)
+
+
+def refuse_no_data(head: bytes, path: str) -> None:
+    """Check that a file's first bytes could be data of some format.
+
+    Raises
+    ------
+    MapDataError
+        ``empty_file``, ``zero_filled`` or ``lfs_pointer``.
+    """
+    if not head:
+        raise refusal("empty_file", "the file is empty (0 bytes)", path=path, offset=0)
+    if not head.strip(b"\0"):
+        raise refusal("zero_filled", "nothing but zero bytes", path=path, offset=0)
+    if head.startswith(_LFS):
+        message = "a git-lfs pointer instead of the data"
+        raise refusal("lfs_pointer", message, path=path, offset=0, hint="run git lfs pull")

@@ -121,15 +121,13 @@ class _OpeningMap:
 
 def _open_files(settings: LiveSettings) -> tuple[Folder, MapDatabase]:
     """Open a map's directory and read it; a new run of the map begins."""
-    with contextlib.ExitStack() as undo:
-        folder = Folder(settings.path)
-        undo.callback(folder.close)
+    folder = Folder(settings.path)
+    try:
         fixed = MapSettings(settings.resolution, settings.occupancy, settings.frame_id)
-        database = MapDatabase(folder, fixed)
-        undo.callback(database.close)
-        database.begin_run()
-        undo.pop_all()
-    return folder, database
+        return folder, MapDatabase(folder, fixed)
+    except BaseException:
+        folder.close()
+        raise
 
 
 def _reason(error: BaseException) -> str:
@@ -337,7 +335,7 @@ class _Worker:
 
     def _may_end(self, ending: messages.End, now_s: float) -> bool:
         """Return whether all is saved, or saving has made no progress for a while."""
-        left = [one for one in self._maps.values() if not one.is_saved]
+        left = [one for one in self._maps.values() if not one.paged.all_durable]
         return ending.keep or all(now_s > max(one.paged.saved_s, self._ending_s) + HOPELESS_S for one in left)
 
     def end(self, ending: messages.End) -> tuple[messages.Unsaved, ...]:

@@ -107,8 +107,8 @@ class Mappers:
         self._uses = 0
         self._opening = threading.Lock()
         self.by_number: dict[int, ActiveMapper] = {}
-        for one in database.mappers:
-            last = max(record.of(one.number), database.applied.get(one.number, 0))
+        for one in database.record.mappers:
+            last = max(record.of(one.number), database.record.applied.get(one.number, 0))
             self.by_number[one.number] = ActiveMapper(one, one.scans + 1, last=last)
 
     def open(self, uid: int, name: str, session: int) -> ActiveMapper:

@@ -29,6 +29,7 @@ from shmmap.chunks.layout import (
 from shmmap.chunks.marks import Marks
 from shmmap.chunks.voxels import CHUNK_SIDE, ChunkKey
 from shmmap.errors import CannotStart, PackageMissing, SegmentCorrupt
+from shmmap.live_worker.changes import Changes
 from shmmap.live_worker.chunk_memory import ChunkFile, ChunkMemory, memory_bytes
 from shmmap.live_worker.disk.map_database import MapDatabase
 from shmmap.live_worker.paging.durability import Chunk, Scan
@@ -127,19 +128,13 @@ def _outcomes(works: list[Callable[[], Any]]) -> list[Future[Any]]:
 
 
 class Observer(Protocol):
-    """Receives the changes of a live map, in the thread of its turns."""
+    """Receives the progress of a live map's scans, in the thread of its turns."""
 
     def scan_applied(self, scan: Scan) -> None:
         """Handle that a scan is in memory that outlives this process."""
 
     def scan_durable(self, scan: Scan) -> None:
         """Note that a scan is on the disk."""
-
-    def chunk_changed(self, key: ChunkKey) -> None:
-        """Handle that a chunk was loaded into memory, or changed there."""
-
-    def chunk_gone(self, key: ChunkKey) -> None:
-        """Note that a chunk left memory."""
 
 
 class _Part(NamedTuple):
@@ -159,7 +154,7 @@ class PagedMap:
     limits
         Limits of the map's memory and files.
     observer
-        Receives the changes of scans and chunks.
+        Receives the progress of scans.
     wake
         Called in another thread when there is work for the next turn.
     codec
@@ -167,6 +162,8 @@ class PagedMap:
 
     Attributes
     ----------
+    changes : Changes
+        Numbered changes of the chunks in memory.
     stored : KeyIndex
         Chunks that are saved, in order.
     problems : dict
@@ -192,13 +189,14 @@ class PagedMap:
         self.stored = KeyIndex(database.rows)
         self.problems: dict[str, str] = {}
         self.saved_s = -math.inf
+        self.changes = Changes(time.time_ns())
         self._observer = observer
         self._codec = codec
         self._undo = UndoRecord(memory.record("undo", UNDO_BYTES))
         self._writer = ChunkWriter(database.settings.occupancy, self._undo)
         self._threads = FileThreads(wake)
         self._parts: dict[Scan, _Part] = {}
-        self._generation = database.begin_run() << 32
+        self._generation = database.record.runs << 32
         self._look_s = 0.0
         self._end_s: float | None = None
         for key, row in database.rows.items():
@@ -292,7 +290,7 @@ class PagedMap:
         self.residency.adopt(
             key, version=version, saved=saved, nbytes=chunk.nbytes, active=active, now_s=now_s
         )
-        self._observer.chunk_changed(key)
+        self.changes.note_changed(key)
 
     # --- scans and clients ----------------------------------------------------------------------
 
@@ -343,7 +341,7 @@ class PagedMap:
             self._apply(chunk, scan, now_s, now_ns)
         while (gone := residency.evict_next(now_s)) is not None:  # now there is memory for others
             self.memory.give_up(self.chunks.pop(gone.key))
-            self._observer.chunk_gone(gone.key)
+            self.changes.note_gone(gone.key)
         jobs = []
         while (cold := residency.begin_load(now_s)) is not None:
             self._generation += 1
@@ -390,10 +388,6 @@ class PagedMap:
         """Call ``work`` in a file thread; ``then`` gets the outcome in a later turn."""
         self._threads.start([Job(work, then)])
 
-    def wait(self, seconds: float) -> None:
-        """Wait at most ``seconds`` until a file was read or written; return at once if no job runs."""
-        self._threads.wait(seconds)
-
     # --- applying -------------------------------------------------------------------------------
 
     def _apply(self, chunk: Chunk, scan: Scan, now_s: float, now_ns: int) -> None:
@@ -404,7 +398,7 @@ class PagedMap:
         more = memory_bytes(bricks) - chunk.nbytes
         if more > 0 and not self.residency.may_grow(chunk, more):
             return
-        known = {mapper.number for mapper in self.database.mappers}
+        known = {mapper.number for mapper in self.database.record.mappers}
         try:
             self._writer.apply(
                 file.view,
@@ -424,7 +418,7 @@ class PagedMap:
         self._note("enlarged")
         version, active = int(file.view.state["version"]), int(file.view.state["active"])
         self.residency.applied(chunk, scan, version=version, nbytes=file.nbytes, active=active, now_s=now_s)
-        self._observer.chunk_changed(chunk.key)
+        self.changes.note_changed(chunk.key)
         if scan.applied:
             self._note_applied(scan)
 
@@ -457,7 +451,7 @@ class PagedMap:
         self.chunks[chunk.key] = file
         version, active = int(file.view.state["version"]), int(file.view.state["active"])
         self.residency.loaded(chunk, version=version, nbytes=file.nbytes, active=active)
-        self._observer.chunk_changed(chunk.key)
+        self.changes.note_changed(chunk.key)
 
     def note_lost(self, key: ChunkKey, now_s: float) -> None:
         """Note that a chunk has no good file any more; save it again if memory has all of it."""
@@ -533,7 +527,7 @@ class PagedMap:
 
     def _finish(self, applied: dict[int, int] | None) -> None:
         self.database.write_record(applied)
-        self.database.finish()
+        self.database.bring_log_in()
 
     def remove_from_memory(self) -> None:
         """Evict all chunks."""

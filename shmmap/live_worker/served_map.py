@@ -15,7 +15,7 @@ from typing import Any, Final, TypeVar
 import msgspec
 
 from shmmap.chunks.marks import decode_marks
-from shmmap.chunks.voxels import CHUNK_SIDE, FURTHEST_SENSOR, ChunkKey
+from shmmap.chunks.voxels import CHUNK_SIDE, FURTHEST_SENSOR
 from shmmap.errors import BadRequest, Busy, CannotWrite, InternalError, NotPermitted, ShmmapError
 from shmmap.live_messages import MAX_PER_SESSION, Ask
 from shmmap.live_settings import LiveSettings
@@ -27,7 +27,7 @@ from shmmap.live_worker.paged_map import PagedMap
 from shmmap.live_worker.paging.durability import Chunk, Scan
 from shmmap.live_worker.paging.residency import Limits
 from shmmap.live_worker.paging.windows import place_ahead
-from shmmap.live_worker.readers import Changes, Readers
+from shmmap.live_worker.readers import Readers
 from shmmap.logfmt import log
 from shmmap.protocol import live as messages
 from shmmap.protocol.messages import ErrorReply
@@ -96,9 +96,8 @@ class ServedMap:
     ) -> None:
         self.settings = settings
         self.paged = PagedMap(database, memory, limits, self, wake, codec)
-        self.changes = Changes(time.time_ns())
         self.mappers = Mappers(database, AppliedScans(memory.record("applied", APPLIED_BYTES)))
-        self.readers = Readers(self.paged, self.changes, answer, wake)
+        self.readers = Readers(self.paged, answer, wake)
         self._marks = marks
         self._answer = answer
         self._tickets: dict[tuple[int, int], list[_Ticket]] = {}  # of scans accepted and not applied yet
@@ -132,7 +131,7 @@ class ServedMap:
             self._scan(ask, message, now_s)
         elif isinstance(message, messages.LiveMove):
             self._move(ask.session, message.position, now_s)
-            self._answer(ask.ticket, messages.LiveMoved(message.request, self.changes.number))
+            self._answer(ask.ticket, messages.LiveMoved(message.request, self.paged.changes.number))
         elif isinstance(message, messages.LiveSave):
             self._saves.append((ask, message, self.paged.not_durable()))
         elif isinstance(message, messages.LiveChunks | messages.LiveVoxels):
@@ -292,14 +291,6 @@ class ServedMap:
 
     # --- changes of the map ----------------------------------------------------------------
 
-    def chunk_changed(self, key: ChunkKey) -> None:
-        """Record that a chunk was loaded into memory, or changed there."""
-        self.changes.note_changed(key)
-
-    def chunk_gone(self, key: ChunkKey) -> None:
-        """Record that a chunk left memory."""
-        self.changes.note_gone(key)
-
     def scan_applied(self, scan: Scan) -> None:
         """Answer all requests that contain this scan."""
         self._scans += 1
@@ -357,10 +348,10 @@ class ServedMap:
         if self._saves:
             self._answer_saves()
         self.readers.run_turn(now_s)
-        due = now_s >= self._record_s and self.changes.number != self._recorded
+        due = now_s >= self._record_s and self.paged.changes.number != self._recorded
         if due or self.paged.database.record_is_due:
             self.paged.database.record_is_due = False
-            self._record_s, self._recorded = now_s + RECORD_S, self.changes.number
+            self._record_s, self._recorded = now_s + RECORD_S, self.paged.changes.number
             self.paged.write_record(self._durable_scans())
 
     def next_turn_s(self, now_s: float) -> float:
@@ -400,7 +391,7 @@ class ServedMap:
             damaged=losses,
             mappers=tuple(f"{one.mapper.uid}/{one.mapper.name}" for one in self.mappers.by_number.values()),
             problem=paged.problem,
-            change=self.changes.number,
+            change=self.paged.changes.number,
             beside_bytes=residency.beside_bytes,
             readers=self.readers.busiest,
             damaged_count=losses_count,
@@ -408,11 +399,6 @@ class ServedMap:
         )
 
     # --- the end --------------------------------------------------------------------------------
-
-    @property
-    def is_saved(self) -> bool:
-        """Whether all scans are on disk."""
-        return self.paged.all_durable
 
     def stop_accepting(self) -> None:
         """Stop accepting scans: waiting scans are sent again to the next run."""

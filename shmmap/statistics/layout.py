@@ -43,11 +43,6 @@ class Header(NamedTuple):
     bucket_count: int
 
     @property
-    def descriptions_end(self) -> int:
-        """End of the constant part, in a segment of this version."""
-        return DESCRIPTIONS_OFFSET + (len(self.counters) + len(self.histograms)) * DESCRIPTION.size
-
-    @property
     def end(self) -> int:
         """Number of bytes of the segment."""
         return max(
@@ -90,16 +85,12 @@ def plan(counters: Sequence[Counter], histograms: Sequence[Counter] = ()) -> Hea
     )
 
 
-def _pack_descriptions(counters: Sequence[Counter]) -> bytes:
-    return b"".join(
-        DESCRIPTION.pack(c.name.encode(), c.unit.encode(), KINDS.index(c.kind), c.help.encode())
-        for c in counters
-    )
-
-
 def pack_header(header: Header) -> bytes:
     """Return the constant bytes: offsets, and descriptions of counters and histograms."""
-    described = _pack_descriptions((*header.counters, *header.histograms))
+    described = b"".join(
+        DESCRIPTION.pack(c.name.encode(), c.unit.encode(), KINDS.index(c.kind), c.help.encode())
+        for c in (*header.counters, *header.histograms)
+    )
     start = START.pack(
         MAGIC,
         *LAYOUT_VERSION,
@@ -175,6 +166,8 @@ def pack_identity(sequence: int, payload: bytes, size: int) -> bytes:
 
 def unpack_identity(data: bytes) -> tuple[int, bytes] | None:
     """Return sequence and payload of an identity block; None if it was never written or is torn."""
+    if len(data) < IDENTITY.size:
+        return None
     sequence, length, crc = IDENTITY.unpack_from(data)
     payload = data[IDENTITY.size : IDENTITY.size + length]
     if not sequence or len(payload) != length:

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from shmmap.protocol.rows import ClientRow, LiveMapRow
 
 _ATTEMPTS = 100
-_HEADER_BYTES = 16384
+_MOST_HEADER_BYTES = 80 << 10
 
 
 class Snapshot:
@@ -50,8 +50,6 @@ class Snapshot:
         Seconds since the daemon last wrote; infinite when absent.
     beat_monotonic_ns : int
         Time of that write, CLOCK_MONOTONIC.
-    size_bytes : int
-        Memory of the segment.
     clients, live
         Clients and live maps, which only the daemon lists; None and empty until it has.
     """
@@ -64,12 +62,10 @@ class Snapshot:
         values: State | None = None,
         *,
         beat_age_s: float = float("inf"),
-        size_bytes: int = 0,
     ) -> None:
         self.identity = identity
         self.beat_age_s = beat_age_s
         self.beat_monotonic_ns = values.beat_monotonic_ns if values is not None else 0
-        self.size_bytes = size_bytes
         self.clients: Sequence[ClientRow] | None = None
         self.live: Sequence[LiveMapRow] = ()
         self._header = header
@@ -181,7 +177,6 @@ class StatisticsReader:
             header,
             state,
             beat_age_s=max(age_s, 0.0),
-            size_bytes=status.st_blocks * 512,
         )
 
     def _who(self, header: Header) -> tuple[DaemonIdentity, WriterProcess]:
@@ -215,19 +210,8 @@ def read_statistics(instance: str = "default", shm_dir: str = DEFAULT_SHM_DIR) -
         return reader.snapshot()
 
 
-_last_header: tuple[bytes, Header] | None = None
-"""Bytes and content of the last header, which is the same for all daemons of one version."""
-
-
 def _read_header(fd: int, size: int) -> Header:
-    global _last_header
-    data = os.pread(fd, _HEADER_BYTES, 0)
-    if _last_header is not None and data.startswith(_last_header[0]):
-        header = _last_header[1]
-    else:
-        data += os.pread(fd, 65536, len(data))
-        header = unpack_header(data)
-        _last_header = data[: header.descriptions_end], header
+    header = unpack_header(os.pread(fd, _MOST_HEADER_BYTES, 0))
     if header.end > size:
         raise SegmentCorrupt(f"the statistics claim {header.end} bytes, there are {size}")
     return header
@@ -237,16 +221,9 @@ def _newest_identity(fd: int, header: Header) -> bytes:
     # the writer fills the older of the two blocks, so one of them is whole at any instant; both
     # look torn only if the writer came round twice while we read
     for _ in range(_ATTEMPTS):
-        found = []
-        for place in (header.identity_offset, header.identity_offset + header.identity_bytes):
-            data = os.pread(fd, 2048, place)  # enough for ordinary paths
-            length = IDENTITY.unpack_from(data)[1] if len(data) >= IDENTITY.size else 0
-            if IDENTITY.size + length > len(data):
-                data = os.pread(fd, min(IDENTITY.size + length, header.identity_bytes), place)
-            block = unpack_identity(data) if len(data) >= IDENTITY.size else None
-            if block is not None:
-                found.append(block)
-        if found:
+        places = header.identity_offset, header.identity_offset + header.identity_bytes
+        blocks = [unpack_identity(os.pread(fd, header.identity_bytes, place)) for place in places]
+        if found := [block for block in blocks if block is not None]:
             return max(found)[1]
     raise SegmentCorrupt("the statistics' identity is damaged")
 

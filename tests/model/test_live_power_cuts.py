@@ -36,7 +36,7 @@ class Disk:
         self.now: dict[ChunkKey, int] = {}
         self.durable: dict[ChunkKey, int] = {}
         self.flushed = self.cuts = 0
-        self.database.finish()
+        self.database.bring_log_in()
         self.base = self.read("map.db")
 
     def read(self, name: str) -> bytes:
@@ -58,7 +58,7 @@ class Disk:
         """Bring the log into the database; the power may fail with any part of that done."""
         self.flush()
         log = self.read("map.db-wal")
-        self.database.finish()
+        self.database.bring_log_in()
         whole = self.read("map.db")
         for _ in range(3):
             half = bytearray(self.base.ljust(len(whole), b"\0"))
@@ -100,7 +100,6 @@ class Disk:
                 data = again.load(key)
                 assert data is not None
                 assert ChunkView(data).state["version"] == again.version(key)
-            again.begin_run()
         with closing(sqlite3.connect(found / "map.db")) as tables:
             assert tables.execute("pragma integrity_check").fetchone() == ("ok",)
 
@@ -109,7 +108,6 @@ class Disk:
 def test_a_power_cut_at_any_time_loses_nothing_durable(tmp_path: Path, seed: int) -> None:
     rng = random.Random(seed)
     disk = Disk(tmp_path / "map", rng)
-    disk.database.begin_run()
     disk.flush()
     for _ in range(12):
         for _ in range(rng.randrange(1, 12)):

@@ -94,7 +94,7 @@ class Served:
         waiting = Deadline()
         while waiting(not done()):
             self.turn(save_all=save_all)
-            self.paged.wait(0.01)
+            self.paged._threads.wait(0.01)
 
     def answer(self, ticket: int, *, save_all: bool = False) -> Any:
         """Turn until a request is answered."""
@@ -107,7 +107,7 @@ class Served:
             return
         self.ended = True
         if not keep:
-            self.until(lambda: self.map.is_saved, save_all=True)
+            self.until(lambda: self.paged.all_durable, save_all=True)
         self.map.end(keep=keep)
         self.marks.close()
         self.paged.memory.close()

@@ -10,8 +10,7 @@ import shutil
 import sys
 import textwrap
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, Final
 
 from shmmap.cli.screens.output import (
@@ -94,44 +93,15 @@ _NAMES: Final = 10  # columns before the lines
 _COLUMNS: Final = ("PROCESSES", "MEMORY", "CPU TIME", "FIRST MAP", "LOOP HELD UP")
 
 
-@dataclass(frozen=True, slots=True)
-class DemoReport:
-    """The result of a demonstration.
-
-    Attributes
-    ----------
-    document
-        What ``--json`` prints.
-    lines
-        Lines of the report by name.
-    picture_svg
-        The picture.
-    picture_png
-        A picture of the points; empty without one.
-    passed
-        Whether all checks passed.
-    rows
-        Rows of the table of memory and times; empty without a table.
-    """
-
-    document: dict[str, Any]
-    lines: dict[str, str]
-    picture_svg: str
-    passed: bool
-    rows: Sequence[Sequence[str]] = ()
-    picture_png: bytes = b""
-
-
-def print_report(report: DemoReport, picture: str, duration_s: float) -> None:
+def print_report(result: DemoResult, picture: str, duration_s: float) -> None:
     """Print the table, then each line after its name; no wider than a page, also in a pipe."""
     print_line()
-    if report.rows:
-        columns = [Column(name, "right" if number else "left") for number, name in enumerate(_COLUMNS)]
-        print_table(columns, report.rows)
-        print_line()
+    columns = [Column(name, "right" if number else "left") for number, name in enumerate(_COLUMNS)]
+    print_table(columns, _rows(result))
+    print_line()
     width = shutil.get_terminal_size().columns if sys.stdout.isatty() else _WIDTH
     duration = f"{format_duration(duration_s)}; picture: {picture}"
-    for name, text in {**report.lines, "duration": duration}.items():
+    for name, text in {**_lines(result), "duration": duration}.items():
         for line in textwrap.wrap(
             text,
             max(min(width, _WIDTH), _NARROWEST),
@@ -143,8 +113,8 @@ def print_report(report: DemoReport, picture: str, duration_s: float) -> None:
             print_line(line)
 
 
-def town_report(result: DemoResult) -> DemoReport:
-    """Report a drive on one shared copy of the map, and one on private copies."""
+def _rows(result: DemoResult) -> list[list[str]]:
+    """Return the table's rows: memory and times with one shared copy of the map, and with private ones."""
     rows = []
     for each in result.rounds:
         copies = "private copies" if each.consumers > 1 else "private copy"
@@ -153,9 +123,14 @@ def town_report(result: DemoResult) -> DemoReport:
             rows.append(
                 [f"{each.consumers} {name}", format_bytes(drive.total_bytes), *map(format_duration, seconds)]
             )
-    town, out, found = result.town, result.outage, result.localization
+    return rows
+
+
+def demo_document(result: DemoResult) -> dict[str, Any]:
+    """Return what ``--json`` prints, but for the pictures and the duration."""
+    town, found = result.town, result.localization
     more_shared, more_private = result.one_more_bytes
-    document = {
+    return {
         "town": {
             "cells": town.cells,
             "points": town.points,
@@ -164,14 +139,12 @@ def town_report(result: DemoResult) -> DemoReport:
         },
         "rounds": [dataclasses.asdict(each) for each in result.rounds],
         "one_more_bytes": {"shared": more_shared, "private": more_private},
-        "outage": dataclasses.asdict(out),
+        "outage": dataclasses.asdict(result.outage),
         "localization": dataclasses.asdict(found) if found else None,
     }
-    passed = found is None or found.trustworthy == found.scans
-    return DemoReport(document, _town_lines(result), _draw(result), passed, rows, town.picture_png)
 
 
-def _town_lines(result: DemoResult) -> dict[str, str]:
+def _lines(result: DemoResult) -> dict[str, str]:
     town, out, found = result.town, result.outage, result.localization
     last = result.rounds[-1]
     count, shared, private = last.consumers, last.shared, last.private
@@ -218,7 +191,7 @@ def _town_lines(result: DemoResult) -> dict[str, str]:
     }
 
 
-def _draw(result: DemoResult) -> str:
+def draw_town(result: DemoResult) -> str:
     """Draw the town from above, with the route and the cells in shared memory, as SVG."""
     from shmmap.cli.screens.picture import CellSquare, Raster, Vehicle, top_view_svg
 

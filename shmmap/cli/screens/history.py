@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
+from functools import reduce
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from shmmap.cli.screens.status_parts import taken_bytes
@@ -86,7 +87,7 @@ class History:
         taken = taken_bytes(found.counters) / max(found.counters["budget_bytes"], 1)
         self._pending.append(Sample(min(taken, 1.0), **counts, waits=waited.total, waited_ns=waited.sum_ns))
         if len(self._pending) == self._joined:
-            self._samples.append(_one(self._pending))
+            self._samples.append(reduce(Sample.joined, self._pending))
             self._pending = []
         if len(self._samples) == MAX_SAMPLES:
             pairs = zip(self._samples[::2], self._samples[1::2], strict=True)
@@ -95,18 +96,11 @@ class History:
 
     def samples(self, width: int) -> list[Sample]:
         """Return the samples of all that was seen, at most ``width``, oldest first."""
-        samples = [*self._samples, *([_one(self._pending)] if self._pending else [])]
+        samples = [*self._samples, *([reduce(Sample.joined, self._pending)] if self._pending else [])]
         if len(samples) <= width:
             return samples
         ends = [len(samples) * index // width for index in range(width + 1)]
-        return [_one(samples[begin:end]) for begin, end in itertools.pairwise(ends)]
-
-
-def _one(samples: Sequence[Sample]) -> Sample:
-    found = samples[0]
-    for sample in samples[1:]:
-        found = found.joined(sample)
-    return found
+        return [reduce(Sample.joined, samples[begin:end]) for begin, end in itertools.pairwise(ends)]
 
 
 def spark(

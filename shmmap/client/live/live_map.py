@@ -197,7 +197,7 @@ class LiveMap:
         NoAnswer
             Saving took longer, because a disk is full or slow; see `status`.
         """
-        seconds = checked_seconds("timeout_s", timeout_s)
+        seconds = checked_seconds(timeout_s)
         reply = self._ask(lambda n: messages.LiveSave(n, self.name), messages.LiveDurable, quiet_s=seconds)
         return reply.files
 

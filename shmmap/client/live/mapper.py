@@ -236,7 +236,7 @@ class LiveMapper:
             raise BadRequest("a mapper needs a name", hint="one that the program keeps: 'front_lidar'")
         self.name = name
         self.counts = ScanCounts(0, 0, 0, 0, 0)
-        timeout_s = self._timeout_s = checked_seconds("timeout_s", timeout_s)
+        timeout_s = self._timeout_s = checked_seconds(timeout_s)
         sender = self._sender = _Sender(
             session.path, live_map, name, frame_id, session.timeout_s, timeout_s, resume=resume
         )
@@ -317,7 +317,7 @@ class LiveMapper:
         ShmmapError
             The error because of which a scan could not be applied.
         """
-        timeout_s = self._timeout_s if timeout_s is None else checked_seconds("timeout_s", timeout_s)
+        timeout_s = self._timeout_s if timeout_s is None else checked_seconds(timeout_s)
         sender = self._sender
         with sender.changed:
             sender.changed.wait_for(
@@ -334,7 +334,7 @@ class LiveMapper:
 
         Raises as `wait_applied`.
         """
-        timeout_s = checked_seconds("timeout_s", timeout_s)
+        timeout_s = checked_seconds(timeout_s)
         self.wait_applied()
         return self._sender.save(timeout_s)
 

@@ -126,20 +126,19 @@ class WindowRefresher:
         if answer.map_version != state.map_version or any(isinstance(f, OverBudget) for f in answer.failed):
             # cells retained outside the window may be outdated, or use memory that cells in the window need
             self.retained.clear()
+        after = msgspec.structs.replace(
+            state,
+            pending=answer.pending,
+            failed=answer.failed,
+            asked=pose,
+            area=area,
+            epoch=answer.epoch,
+            map_version=answer.map_version,
+            covered=answer.covered,
+        )
         progress = bool(answer.cells or answer.removed)
-        if not progress:
-            after = msgspec.structs.replace(
-                state,
-                pending=answer.pending,
-                failed=answer.failed,
-                asked=pose,
-                area=area,
-                epoch=answer.epoch,
-                map_version=answer.map_version,
-                covered=answer.covered,
-            )
-        else:
-            after = self._apply(state, answer, area, pose, now_s)
+        if progress:
+            after = after.with_cells(self._cells_after(state, answer, now_s))
         self._retain(pose, now_s)
         return after, progress
 
@@ -151,9 +150,8 @@ class WindowRefresher:
             area, held, self.layers, wait_s, pose, populate=self._populate, timeout_s=self._timeout_s
         )
 
-    def _apply(
-        self, state: WindowState, answer: CellSet, area: geometry.Area, pose: Intent, now_s: float
-    ) -> WindowState:
+    def _cells_after(self, state: WindowState, answer: CellSet, now_s: float) -> dict[LayerKey, Cell]:
+        """Return the cells that an answer leaves in the window; retain those that it removes."""
         removed = set(answer.removed)
         cells = {key: cell for key, cell in state.cells.items() if key[0] not in removed}
         if removed:
@@ -163,16 +161,7 @@ class WindowRefresher:
             key = (cell.id, cell.layer)
             cells[key] = cell
             self.retained.pop(key, None)
-        return WindowState.build(
-            cells,
-            pending=answer.pending,
-            failed=answer.failed,
-            asked=pose,
-            area=area,
-            epoch=answer.epoch,
-            map_version=answer.map_version,
-            covered=answer.covered,
-        )
+        return cells
 
     def _retain(self, pose: Intent, now_s: float) -> None:
         if not self.retained:

@@ -127,36 +127,18 @@ class WindowState(msgspec.Struct, frozen=True, eq=False, weakref=True):
             for key, box in missing
         )
 
-    @classmethod
-    def build(
-        cls,
-        cells: Mapping[LayerKey, Cell],
-        *,
-        pending: tuple[PendingLayer, ...],
-        failed: tuple[CellError, ...],
-        asked: Intent,
-        area: geometry.Area,
-        epoch: int,
-        map_version: int,
-        covered: bool = True,
-    ) -> WindowState:
-        """Sort the cells and collect their boxes in arrays for `points_around`."""
+    def with_cells(self, cells: Mapping[LayerKey, Cell]) -> WindowState:
+        """Return this state with other cells, sorted, and their boxes in arrays for `points_around`."""
         ordered = {key: cells[key] for key in sorted(cells)}
         by_layer: dict[str, list[Cell]] = {}
         for (_, layer), cell in ordered.items():
             by_layer.setdefault(layer, []).append(cell)
-        return cls(
-            ordered,
-            {key: cell.version for key, cell in ordered.items()},
-            {layer: tuple(some) for layer, some in by_layer.items()},
-            {layer: np.array([cell.box for cell in some]) for layer, some in by_layer.items()},
-            pending,
-            failed,
-            asked,
-            area,
-            epoch,
-            map_version,
-            covered,
+        return msgspec.structs.replace(
+            self,
+            cells=ordered,
+            versions={key: cell.version for key, cell in ordered.items()},
+            by_layer={layer: tuple(some) for layer, some in by_layer.items()},
+            boxes={layer: np.array([cell.box for cell in some]) for layer, some in by_layer.items()},
         )
 
 

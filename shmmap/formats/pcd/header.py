@@ -16,7 +16,7 @@ from typing import Final, NoReturn
 
 from shmmap.formats.coordinate_system import CoordinateSystem
 from shmmap.formats.pcd.fields import FieldProblem, FieldTable, PcdField, parse_fields
-from shmmap.formats.source_file import refusal
+from shmmap.formats.source_file import refusal, refuse_no_data
 from shmmap.formats.stated_units import decoded, scale_notes, system_of_comments
 
 HEADER_LIMIT_BYTES: Final = 1 << 16  # a header must end within this
@@ -29,7 +29,6 @@ _KEYS: Final = frozenset(
 )
 _ALIASES: Final = {b"COLUMNS": b"FIELDS"}  # name of the FIELDS line in the oldest files; PCL accepts it, too
 _BOM: Final = b"\xef\xbb\xbf"
-_LFS: Final = b"version https://git-lfs"
 _INTEGER: Final = re.compile(rb"[+-]?[0-9]{1,19}\Z")
 
 
@@ -141,16 +140,7 @@ _seen: Final[dict[tuple[bytes, ...], PcdHeader]] = {}
 
 
 def _parse_any(head: bytes, path: str, file_bytes: int) -> PcdHeader:
-    if not head:
-        raise refusal("empty_file", "the file is empty (0 bytes)", path=path, offset=0)
-    if head.startswith(_LFS):
-        raise refusal(
-            "lfs_pointer",
-            "a git-lfs pointer instead of the data",
-            path=path,
-            offset=0,
-            hint="run git lfs pull",
-        )
+    refuse_no_data(head, path)
     return _HeaderParser(head, path, file_bytes).parse()
 
 
@@ -226,8 +216,6 @@ class _HeaderParser:
                 if lower:
                     self.warnings.append("header keys are in lower case")
                 return min(at, len(self.head))
-        if not self.head.strip(b"\0"):
-            raise refusal("zero_filled", "nothing but zero bytes", path=self.path, offset=0)
         if not self.values:
             raise refusal(
                 "not_pcd", "not a PCD file: no PCD header line at its start", path=self.path, offset=0

@@ -17,7 +17,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
-import secrets
 import sqlite3
 import threading
 from collections import deque
@@ -29,30 +28,24 @@ import msgspec
 
 from shmmap.chunks.chunk_file import decode_chunk, read_file_header
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.errors import ConfigError, MapDataError
+from shmmap.errors import MapDataError
 from shmmap.failpoints import step
 from shmmap.formats.durable_file import appearing_file
-from shmmap.live_worker.disk.folder import INTERIM, Folder, named
+from shmmap.live_worker.disk.folder import Folder
 from shmmap.live_worker.disk.map_record import (
     MAP_FILE,
     MAP_FORMAT,
-    OLD_FORMAT,
     Lost,
     Mapper,
     MapRecord,
     MapSettings,
     Row,
     boot_id,
+    check_settings,
     read_map,
 )
-from shmmap.live_worker.disk.old_directory import Chunks, old_files, put_old_files_aside, read_old_chunks
-from shmmap.live_worker.disk.rebuilding import (
-    check_log,
-    finish_replacing,
-    make_database,
-    put_in_place,
-    rebuild,
-)
+from shmmap.live_worker.disk.old_directory import put_old_files_aside
+from shmmap.live_worker.disk.rebuilding import check_log, make_if_missing, rebuild
 from shmmap.live_worker.disk.schema import (
     DATABASE,
     GET_DATA,
@@ -68,7 +61,6 @@ from shmmap.live_worker.disk.schema import (
     read_rows,
     require_local_disk,
     require_log,
-    require_own_files,
     valid_rows,
 )
 from shmmap.logfmt import log
@@ -85,7 +77,7 @@ _LOOKED_AT: Final = 16
 
 
 class MapDatabase:
-    """The database of one live map.  Usable from any thread.
+    """The database of one live map, of which a new run begins.  Usable from any thread.
 
     Parameters
     ----------
@@ -141,54 +133,23 @@ class MapDatabase:
         self._identities: dict[str, tuple[int, int] | None] = {}  # of the files that are open
         self._opened = 0  # times that a database was opened
         self._damage = ""
-        self._is_closed = self._begun = self._flush_failed = False
+        self._is_closed = self._flush_failed = False
         self.record: MapRecord
         self._has_record = False
         require_local_disk(folder)
         try:
-            self._make_if_missing(settings)
+            make_if_missing(folder, settings)
             put_old_files_aside(folder)
             self._open_or_rebuild()
-            _check_settings(self.record.settings, settings)
+            check_settings(self.record.settings, settings)
+            self.record.runs += 1
+            self.record.boot = boot_id()
+            self._write_map()
         except BaseException:
             self.close()
             raise
 
     # --- the start ------------------------------------------------------------------------------
-
-    def _make_if_missing(self, settings: MapSettings) -> None:
-        """Make a database if there is none: for a new map, or from an old directory."""
-        folder, names = self.folder, set(self.folder.names())
-        require_own_files(folder)
-        with named(MAP_FILE):
-            folder.require_regular(MAP_FILE)
-        for name in names:
-            if name.startswith(f".{MAP_FILE}.") and name.endswith(INTERIM):
-                folder.remove(name)
-        if DATABASE in names or finish_replacing(folder):
-            return
-        record = MapRecord(MAP_FORMAT, secrets.token_hex(16), settings)
-        chunks: Chunks = iter(())
-        if MAP_FILE in names:
-            with named(MAP_FILE):
-                record = read_map(folder)
-            if record.format != OLD_FORMAT:
-                raise MapDataError(
-                    f"{MAP_FILE} is there, but the database with the chunks is missing",
-                    path=DATABASE,
-                    hint="bring the file back from a copy; or have `shmmap live reset` put the rest aside",
-                )
-            _check_settings(record.settings, settings)
-            log.info("live map of an earlier version is imported", path=folder.path)
-            chunks = read_old_chunks(folder, record)
-        elif old_files(names):
-            raise MapDataError(
-                "there are chunks, or a list of them, but the file that says what they are is missing",
-                path=MAP_FILE,
-                hint="choose another directory, or bring the file back",
-            )
-        make_database(folder, record, chunks)
-        put_in_place(folder)
 
     def _open_or_rebuild(self) -> None:
         with self._writing:
@@ -280,35 +241,16 @@ class MapDatabase:
         """Settings that were fixed when the map was created."""
         return self.record.settings
 
-    @property
-    def mappers(self) -> list[Mapper]:
-        """All mappers, the oldest first."""
-        return self.record.mappers
-
-    @property
-    def applied(self) -> dict[int, int]:
-        """For each mapper's number, the last scan up to which all are durable, according to the record."""
-        return self.record.applied
-
-    def begin_run(self) -> int:
-        """Return the number of runs of the map, this one included; on disk when this returns."""
-        if not self._begun:
-            self.record.runs += 1
-            self.record.boot = boot_id()
-            self._write_map()
-            self._begun = True
-        return self.record.runs
-
     def add_mapper(self, uid: int, name: str) -> Mapper:
         """Add a mapper with a new number, which is on disk when this returns."""
         mapper = Mapper(self.record.next_mapper, uid, name)
         self.record.next_mapper += 1
-        self._write_change(self.record, "mappers", [*self.mappers, mapper])
+        self._write_change(self.record, "mappers", [*self.record.mappers, mapper])
         return mapper
 
     def forget_mapper(self, mapper: Mapper) -> None:
         """Forget a mapper; its number is not used again."""
-        left = [one for one in self.mappers if one.number != mapper.number]
+        left = [one for one in self.record.mappers if one.number != mapper.number]
         self._write_change(self.record, "mappers", left)
 
     def expect_scan(self, mapper: Mapper, scan: int) -> None:
@@ -490,13 +432,13 @@ class MapDatabase:
             if self.record_is_due and key in self.lost:
                 self._write_map()  # else the damaged row would count at the next start
             if self._log_bytes() > MAX_LOG_BYTES:
-                self._bring_log_in()
+                self.bring_log_in()
             try:
                 self._change(put)
             except OSError as error:
                 if error.errno != errno.ENOSPC:
                     raise
-                self._bring_log_in()  # which has old versions of chunks
+                self.bring_log_in()  # which has old versions of chunks
                 self._change(put)
         step("live.written")
         self.unreadable.pop(key, None)
@@ -537,18 +479,18 @@ class MapDatabase:
                 os.fdatasync(self._log)
                 self._flush_failed = False
         if failed:  # the kernel takes what it could not write for written: it is written elsewhere
-            self._bring_log_in()
+            self.bring_log_in()
             self._flush_failed = False
         step("live.flushed")
         if self._log_bytes() > LOG_BYTES:
             with contextlib.suppress(OSError):  # it grows, and that is tried again
-                self._bring_log_in()
+                self.bring_log_in()
 
     def _log_bytes(self) -> int:
         with self._logging:
             return os.fstat(self._log).st_size if self._log >= 0 else 0
 
-    def _bring_log_in(self) -> None:
+    def bring_log_in(self) -> None:
         """Write what the log has into the database, durably, and cut the log.
 
         Raises
@@ -565,10 +507,6 @@ class MapDatabase:
         with self._writing:
             self._change(bring)
 
-    def finish(self) -> None:
-        """Bring the log into the database, at the end."""
-        self._bring_log_in()
-
 
 def _cut_log(writer: sqlite3.Connection) -> None:
     """Write what the log has into the database, and make the log empty."""
@@ -582,20 +520,3 @@ def _copy_of_record(folder: Folder) -> MapRecord | None:
         found = read_map(folder)
         return found if found.format == MAP_FORMAT else None
     return None
-
-
-def _check_settings(found: MapSettings, wanted: MapSettings) -> None:
-    old_ones = _flat(found)
-    for name, new in _flat(wanted).items():
-        if (old := old_ones[name]) != new:
-            raise ConfigError(
-                f"{name} = {new!r}: the map was made with {old!r}",
-                key=name,
-                hint="leave it as it was, or choose another directory for a new map",
-            )
-
-
-def _flat(settings: MapSettings) -> dict[str, object]:
-    """Return all settings by name, including those of `occupancy`."""
-    found = msgspec.structs.asdict(settings)
-    return {**msgspec.structs.asdict(found.pop("occupancy")), **found}

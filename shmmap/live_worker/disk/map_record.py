@@ -69,6 +69,24 @@ class MapSettings(msgspec.Struct, frozen=True):
         )
 
 
+def check_settings(found: MapSettings, wanted: MapSettings) -> None:
+    """Check that a map was made with these settings; else raise `ConfigError`."""
+    old_ones = _flat(found)
+    for name, new in _flat(wanted).items():
+        if (old := old_ones[name]) != new:
+            raise ConfigError(
+                f"{name} = {new!r}: the map was made with {old!r}",
+                key=name,
+                hint="leave it as it was, or choose another directory for a new map",
+            )
+
+
+def _flat(settings: MapSettings) -> dict[str, object]:
+    """Return all settings by name, including those of `occupancy`."""
+    found = msgspec.structs.asdict(settings)
+    return {**msgspec.structs.asdict(found.pop("occupancy")), **found}
+
+
 class Mapper(msgspec.Struct):
     """A user and the name that one of the user's programs chose.
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import secrets
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 from typing import Final, NamedTuple
@@ -18,8 +19,21 @@ from shmmap.chunks.chunk_file import ChunkFileHeader, check_file
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.errors import BadRequest, MapDataError
 from shmmap.failpoints import step
-from shmmap.live_worker.disk.folder import DAMAGED, Folder, FolderToRead, free_name
-from shmmap.live_worker.disk.map_record import Lost, MapRecord, Row, boot_id, decode_map, read_map
+from shmmap.live_worker.disk.folder import DAMAGED, INTERIM, Folder, FolderToRead, free_name, named
+from shmmap.live_worker.disk.map_record import (
+    MAP_FILE,
+    MAP_FORMAT,
+    OLD_FORMAT,
+    Lost,
+    MapRecord,
+    MapSettings,
+    Row,
+    boot_id,
+    check_settings,
+    decode_map,
+    read_map,
+)
+from shmmap.live_worker.disk.old_directory import Chunks, old_files, read_old_chunks
 from shmmap.live_worker.disk.salvage import Log, Pages, Values, index_entries, table_rows
 from shmmap.live_worker.disk.schema import (
     DATABASE,
@@ -33,6 +47,7 @@ from shmmap.live_worker.disk.schema import (
     make_tables,
     read_record,
     require_log,
+    require_own_files,
 )
 from shmmap.logfmt import log
 
@@ -115,6 +130,41 @@ def finish_replacing(folder: Folder) -> bool:
     return True
 
 
+def make_if_missing(folder: Folder, settings: MapSettings) -> None:
+    """Make a database if there is none: for a new map, or from an old directory."""
+    names = set(folder.names())
+    require_own_files(folder)
+    with named(MAP_FILE):
+        folder.require_regular(MAP_FILE)
+    for name in names:
+        if name.startswith(f".{MAP_FILE}.") and name.endswith(INTERIM):
+            folder.remove(name)
+    if DATABASE in names or finish_replacing(folder):
+        return
+    record = MapRecord(MAP_FORMAT, secrets.token_hex(16), settings)
+    chunks: Chunks = iter(())
+    if MAP_FILE in names:
+        with named(MAP_FILE):
+            record = read_map(folder)
+        if record.format != OLD_FORMAT:
+            raise MapDataError(
+                f"{MAP_FILE} is there, but the database with the chunks is missing",
+                path=DATABASE,
+                hint="bring the file back from a copy; or have `shmmap live reset` put the rest aside",
+            )
+        check_settings(record.settings, settings)
+        log.info("live map of an earlier version is imported", path=folder.path)
+        chunks = read_old_chunks(folder, record)
+    elif old_files(names):
+        raise MapDataError(
+            "there are chunks, or a list of them, but the file that says what they are is missing",
+            path=MAP_FILE,
+            hint="choose another directory, or bring the file back",
+        )
+    make_database(folder, record, chunks)
+    put_in_place(folder)
+
+
 # --- the log ------------------------------------------------------------------------------------
 
 
@@ -195,16 +245,17 @@ class Salvage(NamedTuple):
     record: MapRecord | None
 
 
-def salvage(folder: FolderToRead, map_id: str = "") -> Salvage:
-    """Read what is left; ``map_id`` is that of the chunks that count, empty for all.
+def salvage(folder: FolderToRead) -> Salvage:
+    """Read what is left.
 
     No connection of this process may be open: closing a descriptor would drop its locks.
     """
     with _opened(folder) as versions:
-        return _salvage(versions, map_id)
+        return _salvage(versions, "")
 
 
 def _salvage(versions: Sequence[Pages], map_id: str) -> Salvage:
+    """Read what is left; ``map_id`` is that of the chunks that count, empty for all."""
     rows: dict[ChunkKey, tuple[Row, int]] = {}
     names: dict[ChunkKey, int] = {}
     record = None

@@ -216,17 +216,17 @@ def database_errors(folder: FolderToRead) -> Iterator[None]:
     """
     try:
         yield
-    except sqlite3.OperationalError as error:
+    except sqlite3.DatabaseError as error:
         text = str(error)
-        if "no such" in text or "decode" in text:
-            raise MapDataError(
-                f"its tables are damaged: {text}", path=DATABASE, cause=TABLES_DAMAGED
-            ) from error
         if "locked" in text:
             raise OSError(errno.EAGAIN, "another process has locked its database") from error
         disk = os.statvfs(folder.place(""))
         free = disk.f_bavail * disk.f_frsize
-        if "full" in text and free > _PLENTY:  # a damaged page has a number that no page can have
+        if (
+            not isinstance(error, sqlite3.OperationalError)
+            or any(word in text for word in ("no such", "decode"))
+            or ("full" in text and free > _PLENTY)  # a damaged page has a number that no page can have
+        ):
             raise MapDataError(
                 f"its tables are damaged: {text}", path=DATABASE, cause=TABLES_DAMAGED
             ) from error
@@ -236,5 +236,3 @@ def database_errors(folder: FolderToRead) -> Iterator[None]:
         if "unable to open" in text and not os.access(folder.place(DATABASE), os.R_OK | os.W_OK):
             number = errno.EACCES
         raise OSError(number, f"{os.strerror(number)} ({text})") from error
-    except sqlite3.DatabaseError as error:
-        raise MapDataError(f"its tables are damaged: {error}", path=DATABASE, cause=TABLES_DAMAGED) from error

@@ -99,7 +99,6 @@ class Page:
         self.retry_s: dict[int, float] = {}
         self.sent_bytes = self.place_bytes = 0
         self.points = 0
-        self.is_over = False
         self._origin = start
         self._eye = Eye(math.inf, 0.0, 0.0)
         self._root = browser.scene.add_frame(_ROOT, show_axes=False, position=_negative(start))

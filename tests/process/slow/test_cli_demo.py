@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from shmmap.cli.screens.demo import print_report, town_report
+from shmmap.cli.screens.demo import print_report
 from shmmap.demo.consumer import Pose, StepReport
 from shmmap.demo.demo import run_demo
 from shmmap.demo.demo_town import DemoSettings
@@ -146,7 +146,7 @@ def test_without_numba_the_demo_says_what_is_left_out(
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
     result = run_demo(SMALL, Progress())
     assert (result.localization, result.missing) == (None, "numba")
-    print_report(town_report(result), "town.svg", 1.0)
+    print_report(result, "town.svg", 1.0)
     lines = [line for line in capsys.readouterr().out.splitlines() if line[:1].islower() or line[:3] == "CPU"]
     assert [line.split("  ")[0] for line in lines] == [
         "town",

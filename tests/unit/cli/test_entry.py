@@ -14,6 +14,7 @@ import pytest
 
 from shmmap import errors
 from shmmap.cli.entry import main
+from shmmap.cli.program import _drop_output
 from shmmap.cli.verbs.run import about
 from shmmap.version import build_version
 from tests.unit.conftest import Verb
@@ -161,3 +162,13 @@ def test_other_instances_are_named(tmp_path: Path, verb: Verb) -> None:
         (tmp_path / name).touch()
     said = verb(["status", "--shm-dir", str(tmp_path), "--instance", "twon"], 69).err
     assert "hint: other instances are there: city, town; name one with --instance" in said
+
+
+def test_output_that_is_dropped_takes_no_descriptor() -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    with open(writer, "w") as stream:
+        before = os.listdir("/proc/self/fd")
+        _drop_output(stream)
+        assert os.listdir("/proc/self/fd") == before
+        stream.write("nobody reads it")

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import grp
 import os
 import socket
 import time
@@ -544,6 +545,14 @@ def test_groups(ward: Ward, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(access, "groups_of", lambda _: {61999})
     found = access.check_group(someone)
     assert (found.state, "log in again" in found.advice) == ("warn", True)
+
+
+def test_a_group_whose_name_is_a_number(ward: Ward, monkeypatch: pytest.MonkeyPatch) -> None:
+    named = grp.struct_group(("61999", "x", os.getegid(), []))
+    monkeypatch.setattr(grp, "getgrnam", {"61999": named}.__getitem__)
+    ward.file("/proc/4242/status", "")
+    someone = ward.diagnosis(snapshot(), group="61999", uid=USER + 1)
+    assert access.check_group(someone).state == "ok", "as the daemon takes it"
 
 
 def test_sockets(tmp_path: Path, ward: Ward, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -115,7 +115,7 @@ def test_without_memory_the_record_says_what_is_in_the_map(disk: Folder, mappers
     database = MapDatabase(disk, SETTINGS)
     database.write_record({front.mapper.number: 7})
     database.write_record(None)  # nothing new is known
-    assert MapDatabase(disk, SETTINGS).applied == {front.mapper.number: 7}
+    assert MapDatabase(disk, SETTINGS).record.applied == {front.mapper.number: 7}
     for record, applied in ((bytearray(APPLIED_BYTES), 7), (_noted(front.mapper.number, 12), 12)):
         later = Mappers(MapDatabase(disk, SETTINGS), AppliedScans(record))
         assert later.open(1000, "front", 1).applied == applied
@@ -171,7 +171,7 @@ def test_a_mapper_goes_on_while_the_disk_is_full(
         assert [one.mapper.name for one in mappers.by_number.values()] == ["front"]
     mappers.expect(number, 2 * SCANS_AHEAD, 1)
     rear = mappers.open(1000, "rear", 2)
-    found = MapDatabase(disk, SETTINGS).mappers
+    found = MapDatabase(disk, SETTINGS).record.mappers
     assert [(one.number, one.name) for one in found] == [(number, "front"), (rear.mapper.number, "rear")]
     assert found[0].scans > 2 * SCANS_AHEAD
 
@@ -188,6 +188,6 @@ def test_a_mapper_that_cannot_be_forgotten_stays(
                 mappers.open(1000, "new", 1)
         assert len(mappers.by_number) == MAPPERS
     mappers.open(1000, "new", 1)
-    assert [one.name for one in MapDatabase(disk, SETTINGS).mappers] == [
+    assert [one.name for one in MapDatabase(disk, SETTINGS).record.mappers] == [
         *(f"m{number}" for number in range(1, MAPPERS)), "new",
     ]  # fmt: skip

@@ -18,7 +18,7 @@ import pytest
 from shmmap.chunks.layout import HEADER_BYTES, new_header
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.errors import BadRequest, OverBudget
-from shmmap.live_worker import readers, voxel_lists
+from shmmap.live_worker import changes, readers, voxel_lists
 from shmmap.live_worker.areas import check_area, inside, key_range, touches
 from shmmap.live_worker.disk.map_record import Row
 from shmmap.live_worker.paging.durability import Scan
@@ -100,10 +100,10 @@ def test_what_changed_and_what_left(served: Served) -> None:
     assert everything.since_known
     assert keys_of(page(served, since=everything.change)) == []
     for key in (b, a, b):
-        served.map.changes.note_changed(key)
+        served.paged.changes.note_changed(key)
     chunk = served.paged.chunks.pop(c)
     served.paged.residency._forget(c)
-    served.map.changes.note_gone(c)
+    served.paged.changes.note_gone(c)
     later = page(served, since=everything.change)
     assert (keys_of(later), later.gone, later.since_known) == ([a, b], (c,), True)
     second = page(served, since=everything.change, after=tuple(a))
@@ -117,15 +117,15 @@ def test_what_changed_and_what_left(served: Served) -> None:
 
 def test_the_longest_answer_is_shorter_than_a_packet_may_be(served: Served) -> None:
     """As many rows and as many gone chunks as there may be, with the longest numbers."""
-    served.map.changes.note_changed(ChunkKey(0, 0, 0))
-    since = served.map.changes.number
+    served.paged.changes.note_changed(ChunkKey(0, 0, 0))
+    since = served.paged.changes.number
     for x in range(20_000):
-        served.map.changes.note_gone(ChunkKey(-(1 << 24) + x, -(1 << 24), -(1 << 24)))
+        served.paged.changes.note_gone(ChunkKey(-(1 << 24) + x, -(1 << 24), -(1 << 24)))
     row = Row(1 << 62, 1 << 40, 1 << 18, 1 << 18, 1 << 18, 1)
     for x in range(MAX_CHUNK_ROWS):
         on_disk(served, ChunkKey(-(1 << 24) + x, 0, -(1 << 24)), row)
     assert not page(served, since=since).since_known
-    first = served.map.changes._gone[0][0]
+    first = served.paged.changes._gone[0][0]
     found = page(served, since=first, saved=True)
     assert found.since_known
     assert len(found.rows) == MAX_CHUNK_ROWS
@@ -137,7 +137,7 @@ def test_chunks_that_are_being_loaded_are_listed(served: Served) -> None:
     there, coming = ChunkKey(2, 0, 0), ChunkKey(3, 0, 0)
     paged = served.paged
     bring(served, there, 2)
-    before = served.map.changes.number
+    before = served.paged.changes.number
     paged.residency.add(Scan(1, 1, 10, {coming}))
     assert paged.residency.begin_load(0.0) is not None
     found = {ChunkKey(*row.key): (row.state, row.generation, row.bytes) for row in page(served).rows}
@@ -233,9 +233,9 @@ def test_a_turn_is_short_and_what_is_asked_for_is_found_by_an_index(
     for x in range(200):
         bring(served, ChunkKey(x, -x, 0))
     if "since" in asked:
-        asked = {"since": served.map.changes.number}
+        asked = {"since": served.paged.changes.number}
     for x in (7, 3, 7):
-        served.map.changes.note_changed(ChunkKey(x, -x, 0))
+        served.paged.changes.note_changed(ChunkKey(x, -x, 0))
     ticket = served.ask(lambda n: LiveChunks(n, "lidar", **asked))
     turns = []
     while ticket not in served.answers:
@@ -319,8 +319,8 @@ def test_the_busiest_readers_are_named(served: Served, monkeypatch: pytest.Monke
 
 
 def test_not_all_that_left_is_remembered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(readers, "MAX_GONE", 3)
-    one = readers.Changes(100)
+    monkeypatch.setattr(changes, "MAX_GONE", 3)
+    one = changes.Changes(100)
     one.note_gone(ChunkKey(0, 0, 0))
     assert [since for since in range(98, 104) if one.known(since)] == [100, 101], "neither of another run"
     for x in range(1, 5):
@@ -555,7 +555,7 @@ def test_lists_of_an_previous_run_are_removed(lists: VoxelLists, shm: Path) -> N
 @pytest.mark.parametrize("scope", ["disk", "all"])
 def test_the_disk_is_read_in_threads(filled: Served, lists: VoxelLists, scope: str) -> None:
     """Some files at a time, and never by the worker itself."""
-    filled.until(lambda: filled.map.is_saved, save_all=True)
+    filled.until(lambda: filled.paged.all_durable, save_all=True)
     if scope == "all":
         for key in KEYS[5:]:
             del filled.paged.residency.chunks[key]
@@ -575,7 +575,7 @@ def test_the_disk_is_read_in_threads(filled: Served, lists: VoxelLists, scope: s
 
 
 def test_a_file_that_cannot_be_read_is_an_error_of_the_one_request(filled: Served) -> None:
-    filled.until(lambda: filled.map.is_saved, save_all=True)
+    filled.until(lambda: filled.paged.all_durable, save_all=True)
     filled.paged.database.load = failing(errno.EIO)  # type: ignore[method-assign]
     failed = filled.answer(filled.ask(lambda n: LiveVoxels(n, "lidar", scope="disk")))
     assert (failed.code, "Input/output error" in failed.message) == ("bad_map_data", True)

@@ -252,7 +252,7 @@ def test_what_was_all_but_given_up_comes_back_from_disk(
     one = serve(**LATER)
     (marks,) = marked(1)
     one.answer(one.send(marks, one.open().mapper, 1))
-    one.until(lambda: one.map.is_saved, save_all=True)
+    one.until(lambda: one.paged.all_durable, save_all=True)
     key = marks.chunks[0]
     gone = shm / one.paged.chunks[key].name[1:]
     one.paged.chunks[key].view.state["state"] = OUT_OF_SERVICE
@@ -279,7 +279,7 @@ def test_scans_of_a_place_that_is_known_take_no_memory(serve: Serve) -> None:
     def after(scans: int) -> int:
         for number in islice(numbers, scans):
             one.answer(one.send(marks, mapper, number))
-        one.until(lambda: one.map.is_saved, save_all=True)
+        one.until(lambda: one.paged.all_durable, save_all=True)
         one.answers.clear()
         return tracemalloc.get_traced_memory()[0]
 
@@ -326,7 +326,7 @@ def test_what_a_previous_run_did_not_save_is_not_durable(serve: Serve) -> None:
     opened = one.open()
     first = opened.next_scan
     assert one.answer(one.send(NOTHING, opened.mapper, first)).durable == 0
-    one.until(lambda: one.map.is_saved, save_all=True)
+    one.until(lambda: one.paged.all_durable, save_all=True)
     assert one.answer(one.send(NOTHING, opened.mapper, first + 1)).durable >= first
 
 
@@ -358,7 +358,7 @@ def test_a_save_is_answered_when_all_that_came_before_is_durable(serve: Serve) -
     one.answer(one.send(second, opened.mapper, 2))
     reply = one.answer(one.ask(lambda n: messages.LiveSave(n, "lidar")))
     assert (reply.scan, reply.files) == (2, len(set(first.chunks) | set(second.chunks)))
-    one.until(lambda: one.map.is_saved)
+    one.until(lambda: one.paged.all_durable)
 
 
 # --- a disk that is full ------------------------------------------------------------------------
@@ -376,7 +376,7 @@ def test_a_disk_that_is_full_stops_no_mapper(serve: Serve, monkeypatch: pytest.M
         start_s = one.now_s
         for _ in range(50):
             one.turn()
-            one.paged.wait(0.01)
+            one.paged._threads.wait(0.01)
         assert len(calls) <= one.paged.limits.saves * (one.now_s - start_s + 2.0), (
             "a bounded number each second"
         )
@@ -385,7 +385,7 @@ def test_a_disk_that_is_full_stops_no_mapper(serve: Serve, monkeypatch: pytest.M
         assert one.voxels() == reference(*scans)
         assert status.dirty
         assert {key for marks in scans for key in marks.chunks} <= set(one.paged.chunks)
-    one.until(lambda: one.map.is_saved, save_all=True)
+    one.until(lambda: one.paged.all_durable, save_all=True)
     assert one.map.status().problem == ""
 
 
@@ -415,7 +415,7 @@ def test_a_directory_that_cannot_be_flushed_is_tried_again_later(
         start_s = one.now_s
         for _ in range(30):
             one.turn()
-            one.paged.wait(0.01)
+            one.paged._threads.wait(0.01)
         assert len(calls) <= 2 + (one.now_s - start_s), "once a second"
         assert "not flushed: Input/output" in one.map.status().problem
         assert ticket not in one.answers

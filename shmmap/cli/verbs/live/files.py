@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shmmap.cli.options import Subparsers, add_json_option, add_verb
+from shmmap.cli.options import Subparsers, add_json_option, add_verb, metres
 from shmmap.cli.program import add_allow_empty, complain, nothing_found
 from shmmap.cli.screens.output import (
     counted,
@@ -22,7 +22,7 @@ from shmmap.cli.screens.output import (
     print_pairs,
 )
 from shmmap.cli.screens.work_progress import fields_text
-from shmmap.cli.verbs.maps.divide import metres, translation
+from shmmap.cli.verbs.maps.divide import translation
 from shmmap.errors import BadRequest, MapDataError, MapMissing, ShmmapError
 from shmmap.formats.durable_file import writing_errors
 

@@ -91,7 +91,7 @@ def _map_row(row: LiveMapRow) -> list[str]:
         row.name,
         f"{row.resolution:g}",
         f"{row.chunks:,}",
-        f"{row.dirty + row.saving:,}",
+        f"{row.unsaved:,}",
         f"{row.active:,}",
         format_bytes(row.bytes + row.beside_bytes),
         format_bytes(row.budget_bytes),
@@ -160,13 +160,12 @@ def _run_show(args: argparse.Namespace) -> int:
 
 
 def _pairs(row: LiveMapRow) -> list[tuple[str, str]]:
-    unsaved = row.dirty + row.saving
     memory = f"{format_bytes(row.bytes)} of {format_bytes(row.budget_bytes)}"
     waiting = f"; {format_bytes(row.waiting_bytes)} of scans wait" if row.waiting_bytes else ""
     beside = f", {format_bytes(row.beside_bytes)} beside them" if row.beside_bytes else ""
     return [
         ("map", f"{row.name}, voxels of {row.resolution:g} m in frame {row.frame_id}"),
-        ("memory", f"{memory} in {row.chunks:,} chunks ({unsaved:,} unsaved){beside}"),
+        ("memory", f"{memory} in {row.chunks:,} chunks ({row.unsaved:,} unsaved){beside}"),
         ("known", f"{row.active:,} voxels in memory"),
         ("disk", f"{format_bytes(row.file_bytes)} in {row.files:,} files in {row.path}"),
         ("scans", f"{row.scans:,} applied since the start, {row.durable:,} of them on the disk{waiting}"),

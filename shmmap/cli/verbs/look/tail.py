@@ -80,7 +80,8 @@ def run(args: argparse.Namespace) -> int:
     deadlines = {} if args.timeout is None else {"timeout": args.timeout}
     with EventStream(endpoint(args), since=args.since, name="shmmap tail", **deadlines) as stream:
         while (happening := stream.next(0.0)) is not None:
-            show(happening)
+            if not _is_me(happening):
+                show(happening)
         sys.stdout.flush()
         said = False
         while follow:
@@ -88,7 +89,8 @@ def run(args: argparse.Namespace) -> int:
             happening = stream.next(SILENT_S)
             if happening is not None:
                 said = False
-                show(happening)
+                if not _is_me(happening):
+                    show(happening)
                 sys.stdout.flush()
             elif not said and time.monotonic() - stream.last_message_s > SILENT_S:
                 # the daemon sends a heartbeat every second: its silence is reported once
@@ -114,9 +116,7 @@ def _fields(happening: Happening) -> dict[str, Any]:
     return {"event": kind, **fields}
 
 
-def _print_json(happening: Happening | None) -> None:
-    if happening is None or _is_me(happening):
-        return
+def _print_json(happening: Happening) -> None:
     fields = _fields(happening)
     for name in HEX_FIELDS:
         if name in fields:
@@ -126,9 +126,7 @@ def _print_json(happening: Happening | None) -> None:
     print_line(json_text(fields))
 
 
-def _print_text(happening: Happening | None) -> None:
-    if happening is None or _is_me(happening):
-        return
+def _print_text(happening: Happening) -> None:
     fields = _fields(happening)
     kind = fields["event"]
     if kind == "live_changed":

@@ -7,7 +7,15 @@ import argparse
 import time
 from typing import TYPE_CHECKING
 
-from shmmap.cli.options import Subparsers, add_cloud_options, add_json_option, add_verb, numbers, size_bytes
+from shmmap.cli.options import (
+    Subparsers,
+    add_cloud_options,
+    add_json_option,
+    add_verb,
+    metres,
+    numbers,
+    size_bytes,
+)
 from shmmap.cli.program import complain
 from shmmap.cli.screens.output import counted, format_bytes
 from shmmap.cli.screens.work_progress import StageProgress, fields_text, print_result
@@ -140,14 +148,6 @@ def run_divide(args: argparse.Namespace) -> int:
     seconds = time.monotonic() - began_s
     print_result(made, _divided_lines(made, checked=args.check), seconds=seconds, as_json=args.json)
     return 0
-
-
-def metres(text: str) -> float:
-    """Parse a length in metres."""
-    try:
-        return float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"expected metres, not {text!r}") from None
 
 
 def translation(text: str) -> Translation:

@@ -11,7 +11,7 @@ import contextlib
 import time
 from typing import TYPE_CHECKING
 
-from shmmap.cli.options import Subparsers, add_json_option, add_verb, at_least
+from shmmap.cli.options import Subparsers, add_json_option, add_verb, at_least, number_of
 from shmmap.cli.screens.output import (
     Column,
     counted,
@@ -87,7 +87,7 @@ def add_versions(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--keep",
         metavar="DAYS",
-        type=_days,
+        type=number_of("days, 7 or more", 7.0, 1e6),
         default=None,
         help="with --prune: how many days, 7 or more (default: 30)",
     )
@@ -97,16 +97,6 @@ def add_versions(subparsers: Subparsers) -> None:
     add_store_options(parser)
     add_sole_publisher_option(parser)
     add_json_option(parser)
-
-
-def _days(text: str) -> float:
-    try:
-        days = float(text)
-    except ValueError:
-        days = -1.0
-    if not 7 <= days < 1e6:
-        raise argparse.ArgumentTypeError(f"expected days, 7 or more, not {text!r}")
-    return days
 
 
 def run_versions(args: argparse.Namespace) -> int:

@@ -8,16 +8,11 @@ import os
 import tempfile
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from shmmap.cli.options import Subparsers, add_json_option, add_verb
+from shmmap.cli.options import Subparsers, add_json_option, add_verb, number_of
 from shmmap.cli.program import write_bytes, write_text
 from shmmap.cli.screens.output import print_json, print_line
 from shmmap.errors import CannotWrite
-
-if TYPE_CHECKING:
-    from shmmap.cli.screens.demo import DemoReport
-    from shmmap.demo.program import Progress
 
 _JSON = """\
   {"town": {"cells", "points", "file_bytes", "build_s"},
@@ -64,25 +59,17 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--density",
         metavar="POINTS",
-        type=_density,
+        type=number_of("2 to 1000 points per square metre", 2.0, 1000.0),
         help="points per square metre of ground, 2 to 1000; fewer are quicker (default: 100, or what fits)",
     )
     add_json_option(parser)
 
 
-def _density(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 2.0 <= value <= 1000.0:
-        raise argparse.ArgumentTypeError(f"expected 2 to 1000 points per square metre, not {text!r}")
-    return value
-
-
 def run(args: argparse.Namespace) -> int:
     """Run the demonstration and print its measurements."""
-    from shmmap.cli.screens.demo import print_report, progress_for
+    from shmmap.cli.screens.demo import demo_document, draw_town, print_report, progress_for
+    from shmmap.demo.demo import run_demo
+    from shmmap.demo.demo_town import PICTURE_FROM, DemoSettings
     from shmmap.processes.interrupts import signals_interrupt
 
     picture = _picture_path(args.svg)
@@ -90,27 +77,27 @@ def run(args: argparse.Namespace) -> int:
     if not args.json:
         _note_of_compiling()
     with signals_interrupt(), progress_for(quiet=args.json) as progress:
-        report = _drive(args, progress)
+        settings = DemoSettings() if args.density is None else DemoSettings(density=args.density)
+        result = run_demo(settings, progress, map_dir=args.keep_map)
     duration_s = time.monotonic() - started_s
-    write_text(picture, report.picture_svg)
-    points = picture.with_suffix(".png")
-    if report.picture_png and points != picture:
-        write_bytes(points, report.picture_png)
+    write_text(picture, draw_town(result))
+    points, picture_png = picture.with_suffix(".png"), result.town.picture_png
+    if picture_png and points != picture:
+        write_bytes(points, picture_png)
     if args.json:
-        pictures = {"svg": str(picture), **({"png": str(points)} if report.picture_png else {})}
-        print_json({**report.document, **pictures, "seconds": round(duration_s, 3)})
+        pictures = {"svg": str(picture), **({"png": str(points)} if picture_png else {})}
+        print_json({**demo_document(result), **pictures, "seconds": round(duration_s, 3)})
     else:
-        print_report(report, _shown(picture), duration_s)
+        print_report(result, _shown(picture), duration_s)
         if args.keep_map:
             print_line(f"Serve the town yourself: shmmap serve {args.keep_map}")
-        if report.picture_png:
-            from shmmap.demo.demo_town import PICTURE_FROM
-
+        if picture_png:
             place = args.keep_map or "TOWN"
             how = "Draw" if args.keep_map else "With --keep-map TOWN, draw"
             print_line(f"The points: {_shown(points)}.  {how} them yourself:")
             print_line(f"  shmmap view {place} --from {PICTURE_FROM} --image {_shown(points)}")
-    return 0 if report.passed else 1
+    found = result.localization
+    return 0 if found is None or found.trustworthy == found.scans else 1
 
 
 def _note_of_compiling() -> None:
@@ -121,20 +108,6 @@ def _note_of_compiling() -> None:
 
     if importlib.util.find_spec("numba") is not None and not are_compiled():
         print_line("compiling kernels meanwhile, once for this version", flush=True)
-
-
-def _drive(args: argparse.Namespace, progress: Progress) -> DemoReport:
-    """Drive on one shared copy of a town's map, and on private copies."""
-    from dataclasses import replace
-
-    from shmmap.cli.screens.demo import town_report
-    from shmmap.demo.demo import run_demo
-    from shmmap.demo.demo_town import DemoSettings
-
-    settings = DemoSettings()
-    if args.density is not None:
-        settings = replace(settings, density=args.density)
-    return town_report(run_demo(settings, progress, map_dir=args.keep_map))
 
 
 def _picture_path(named: str | None) -> Path:

@@ -5,16 +5,12 @@ from __future__ import annotations
 
 import io
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
-from shmmap.cli.screens.demo import (
-    DemoProgress,
-    DemoReport,
-    print_report,
-    progress_for,
-    town_report,
-)
+from shmmap.cli import main
+from shmmap.cli.screens.demo import DemoProgress, print_report, progress_for
 from shmmap.demo.consumer import Pose
 from shmmap.demo.demo import DemoResult, Round
 from shmmap.demo.demo_town import TownMap
@@ -44,23 +40,22 @@ def result() -> DemoResult:
     return DemoResult(110.0, town, rounds, [], outage, found, "")
 
 
-def printed(capsys: pytest.CaptureFixture[str], report: DemoReport) -> tuple[list[str], dict[str, str]]:
+def printed(capsys: pytest.CaptureFixture[str], result: DemoResult) -> tuple[list[str], dict[str, str]]:
     """Lines of the table, and the texts below it by name; all within a terminal's width."""
-    print_report(report, "/tmp/town.svg", 31.0)
+    print_report(result, "/tmp/town.svg", 31.0)
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 79
-    table = lines[1 : lines.index("", 1)] if report.rows else []
+    table = lines[1 : lines.index("", 1)]
     found: dict[str, str] = {}
     name = ""
-    for line in lines[len(table) + (2 if table else 1) :]:
+    for line in lines[len(table) + 2 :]:
         name = line[:10].strip() or name
         found[name] = f"{found.get(name, '')} {line[10:]}".strip()
     return table, found
 
 
 def test_lines_with_what_was_measured(capsys: pytest.CaptureFixture[str]) -> None:
-    report = town_report(result())
-    table, lines = printed(capsys, report)
+    table, lines = printed(capsys, result())
     assert lines == {
         "town": "320 cells, 20.8 million points; a process needs 105 cells, 110 MiB",
         # 80 + 140 + 20 (n - 1) < 115 + 115 (n - 1)
@@ -75,22 +70,19 @@ def test_lines_with_what_was_measured(capsys: pytest.CaptureFixture[str]) -> Non
         "duration": "31.0 s; picture: /tmp/town.svg",
     }
     assert [line.split()[0] for line in table[1:]] == ["1", "1", "8", "8"]
-    assert report.passed
-    lost = replace(result(), localization=LocalizationResult(41, 40, 0.0094, 0.0142, 2.9))
-    assert not town_report(lost).passed
 
 
 def test_a_map_too_small_to_gain_from_sharing_says_so(capsys: pytest.CaptureFixture[str]) -> None:
     sparse = result()
-    assert "--density" not in printed(capsys, town_report(sparse))[1]["memory"]
+    assert "--density" not in printed(capsys, sparse)[1]["memory"]
     sparse.rounds[1] = Round(8, drive(8, 220, 10), drive(8, 170, 0))
-    memory = printed(capsys, town_report(sparse))[1]["memory"]
+    memory = printed(capsys, sparse)[1]["memory"]
     assert "is too small to gain from sharing; --density 100" in memory
 
 
 def test_a_picture_s_long_path_is_in_one_piece(capsys: pytest.CaptureFixture[str]) -> None:
     path = "/" + "/".join(["directory"] * 9) + "/town.svg"
-    print_report(town_report(result()), path, 31.0)
+    print_report(result(), path, 31.0)
     assert capsys.readouterr().out.splitlines()[-1].strip() == path
 
 
@@ -141,3 +133,15 @@ def test_a_terminal_shows_stages_events_and_the_last_lines(monkeypatch: pytest.M
     assert out.getvalue()[len(drawn) :] == (
         "\x1b[9A\x1b[J  The daemon is killed (SIGKILL)\n  step 2 of 3\n    consumer 1\n\x1b[2A\x1b[J"
     )
+
+
+@pytest.mark.parametrize(("trustworthy", "code"), [(41, 0), (40, 1)])
+def test_a_scan_that_is_not_to_be_trusted_is_the_exit_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trustworthy: int, code: int
+) -> None:
+    localized = LocalizationResult(41, trustworthy, 0.0094, 0.0142, 2.9)
+    measured = replace(result(), localization=localized)
+    monkeypatch.setattr("shmmap.demo.demo.run_demo", lambda *_, **_also: measured)
+    picture = tmp_path / "town.svg"
+    assert main(["demo", "--json", "--svg", str(picture)]) == code
+    assert picture.exists()

@@ -22,15 +22,8 @@ AREA = Circle(0.0, 0.0, 100.0)
 def build(
     *cells: Cell, pending: tuple[PendingLayer, ...] = (), failed: tuple[CellError, ...] = ()
 ) -> WindowState:
-    return WindowState.build(
-        {(cell.id, cell.layer): cell for cell in cells},
-        pending=pending,
-        failed=failed,
-        asked=HERE,
-        area=AREA,
-        epoch=1,
-        map_version=1,
-    )
+    state = WindowState(pending=pending, failed=failed, asked=HERE, area=AREA, epoch=1, map_version=1)
+    return state.with_cells({(cell.id, cell.layer): cell for cell in cells})
 
 
 def test_cells_are_in_id_order_with_their_boxes(make_cell: Callable[..., Cell]) -> None:

@@ -47,12 +47,12 @@ def test_all_of_it_is_imported_and_kept(old: Path) -> None:
         assert database.rows.keys() == chunks.keys()
         assert {key: saved_bytes(old, key) for key in chunks} == chunks
         assert all(database.load(key) for key in chunks)
-        assert (database.lost, database.applied) == ({}, {1: 2})
-        assert [(one.number, one.uid, one.name, one.scans) for one in database.mappers] == [
+        assert (database.lost, database.record.applied) == ({}, {1: 2})
+        assert [(one.number, one.uid, one.name, one.scans) for one in database.record.mappers] == [
             (1, 1000, "front", 1 << 20)
         ]
         assert database.map_id == bytes(range(16))
-        assert database.begin_run() == 4
+        assert database.record.runs == 4
         assert database.add_mapper(1000, "rear").number == 2
     assert files_of(old) == {"map.db", "map.json", "imported.1"}
     assert contents(old / "imported.1") == before, "what was there is as it was"
@@ -116,7 +116,6 @@ def test_what_was_lost_has_its_name(old: Path, damage: Callable[[Path, Path], No
         (old / "manifest.json").unlink()
     lost = {ChunkKey.from_text(path.stem)} if manifest or damage is not gone else set()
     with opened(old) as database:
-        database.begin_run()
         assert database.lost.keys() == lost
         assert database.rows.keys() == chunks.keys() - {ChunkKey.from_text(path.stem)}
     with opened(old) as again:
@@ -209,15 +208,14 @@ def test_killed_at_any_step_it_is_imported_by_the_next_start(
         folder = Watched(directory)
         ended = False
         try:
-            with closing(MapDatabase(folder, SETTINGS)) as database:
-                database.begin_run()
+            with closing(MapDatabase(folder, SETTINGS)):
+                pass
             ended = True
         except Killed:
             pass
         finally:
             folder.close()
         with opened(directory) as database:
-            database.begin_run()
             assert database.rows.keys() == chunks.keys()
             assert not database.lost
             assert {key: saved_bytes(directory, key) for key in chunks} == chunks

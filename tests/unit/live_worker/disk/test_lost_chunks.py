@@ -206,7 +206,7 @@ def test_what_memory_has_is_saved_again(damaged: Damaged, name: str, dies: bool)
     if dies:
         served.end(keep=True)
         served = damaged.serve()
-    served.until(lambda: served.map.is_saved, save_all=True)
+    served.until(lambda: served.paged.all_durable, save_all=True)
     for scope in ("disk", "all"):
         assert damaged.answer(served, scope) == (set(), damaged.voxels)
     served.end()
@@ -224,12 +224,12 @@ def test_a_chunk_that_is_lost_twice(damaged: Damaged) -> None:
     (marks,) = (one for one in marked(3)[2:])
     assert damaged.key in marks.chunks
     served.answer(served.send(marks, mapper, 1, at=place[0]))
-    served.until(lambda: served.map.is_saved, save_all=True)
+    served.until(lambda: served.paged.all_durable, save_all=True)
     mapped = damaged.answer(served, "all")
     assert mapped[0] == {damaged.key}
     damaged.damage("a bit of the body")
     assert damaged.answer(served, "disk")[0] == {damaged.key}
-    served.until(lambda: served.map.is_saved, save_all=True)
+    served.until(lambda: served.paged.all_durable, save_all=True)
     assert damaged.answer(served, "disk") == damaged.answer(served, "all") == mapped
     served.end()
     served = damaged.serve()
@@ -266,7 +266,7 @@ def test_tables_that_are_damaged_while_all_of_it_is_in_memory(damaged: Damaged) 
         assert connection is not None
         connection.execute("pragma shrink_memory")  # else what was read before is not read again
     damaged.answer(served, "disk")
-    served.until(lambda: served.map.is_saved and not served.paged.database.lost, save_all=True)
+    served.until(lambda: served.paged.all_durable and not served.paged.database.lost, save_all=True)
     assert damaged.answer(served, "disk") == damaged.answer(served, "all") == (set(), damaged.voxels)
     served.end()
     assert damaged.checked().good

@@ -108,7 +108,7 @@ def test_while_a_daemon_works_with_it(tmp_path: Path) -> None:
             database.save(key, encode_chunk(view, "raw"))
             found = check_in_another_process(tmp_path)
             assert f"{len(database.rows)} chunks" in found
-        database.finish()
+        database.bring_log_in()
         assert (tmp_path / "map.db-wal").stat().st_size == 0
         assert "good" in check_in_another_process(tmp_path)
 
@@ -129,7 +129,7 @@ def test_a_daemon_that_begins_while_the_map_is_read(tmp_path: Path) -> None:
                     view = ChunkView(new_header(SETTINGS.identity(database.map_id, key, 1)))
                     view.state["version"] = version
                     database.save(key, encode_chunk(view, "raw"))
-            database.finish()
+            database.bring_log_in()
             for key in stored.rows:
                 assert stored.chunk(key) is not None
 

@@ -83,8 +83,8 @@ def version_of(made: MapDatabase, key: ChunkKey) -> int:
 def test_a_map_is_made_and_found_again(tmp_path: Path) -> None:
     directory = tmp_path / "state" / "lidar"
     with opened(directory) as made:
-        assert (made.settings, made.mappers, made.rows) == (SETTINGS, [], {})
-        assert made.begin_run() == 1
+        assert (made.settings, made.record.mappers, made.rows) == (SETTINGS, [], {})
+        assert made.record.runs == 1
         mapper = made.add_mapper(1000, "front")
         made.expect_scan(mapper, 0)
         made.save(KEYS[0], chunk(made, KEYS[0], 3))
@@ -96,12 +96,12 @@ def test_a_map_is_made_and_found_again(tmp_path: Path) -> None:
     assert files_of(directory) == {"map.db", "map.json"}
     with opened(directory) as again:
         assert again.map_id == map_id
-        assert again.begin_run() == 2
-        assert [(m.number, m.uid, m.name, m.scans) for m in again.mappers] == [
+        assert again.record.runs == 2
+        assert [(m.number, m.uid, m.name, m.scans) for m in again.record.mappers] == [
             (1, 1000, "front", SCANS_AHEAD)
         ]
         assert again.rows == {KEYS[0]: Row(3, 2688, 0, 0, 0, 0), KEYS[1]: Row(1, 2688, 0, 0, 0, 0)}
-        assert again.applied == {1: 7}
+        assert again.record.applied == {1: 7}
         assert [version_of(again, key) for key in KEYS] == [3, 1, 0]
         assert (again.lost, again.damaged) == ({}, {})
 
@@ -159,8 +159,8 @@ def test_what_is_no_regular_file_keeps_the_map_closed(tmp_path: Path, name: str,
 
 
 def test_a_map_whose_database_is_gone_is_not_made_again(tmp_path: Path) -> None:
-    with opened(tmp_path) as made:
-        made.begin_run()
+    with opened(tmp_path):
+        pass
     (tmp_path / "map.db").unlink()
     with pytest.raises(MapDataError, match="the database with the chunks is missing"), opened(tmp_path):
         pass
@@ -205,7 +205,6 @@ def test_a_file_that_is_not_where_it_was_is_a_problem_until_it_is(tmp_path: Path
 def test_what_was_not_flushed_outlives_the_process(tmp_path: Path) -> None:
     """A copy of the files is what the kernel has: as after SIGKILL."""
     with opened(tmp_path / "map") as made:
-        made.begin_run()
         made.save(KEYS[0], chunk(made, KEYS[0], 3))
         copy_of(tmp_path / "map", tmp_path / "killed")
     with opened(tmp_path / "killed") as again:
@@ -215,23 +214,21 @@ def test_what_was_not_flushed_outlives_the_process(tmp_path: Path) -> None:
 def test_a_copy_that_is_taken_while_it_is_written(tmp_path: Path) -> None:
     """File by file, of no single moment: it opens, and each chunk is whole or has its name."""
     with opened(tmp_path / "map") as made:
-        made.begin_run()
         for key in KEYS:
             made.save(key, chunk(made, key, 1))
-        made.finish()
+        made.bring_log_in()
         for version in range(2, 20):
             for key in KEYS:
                 made.save(key, chunk(made, key, version))
             if version % 5 == 0:
-                made.finish()
+                made.bring_log_in()
             (other := tmp_path / str(version)).mkdir()
             for name in ("map.db", "map.json", "map.db-wal"):
                 (other / name).write_bytes((tmp_path / "map" / name).read_bytes())
                 made.save(KEYS[version % 3], chunk(made, KEYS[version % 3], version + 100))
                 if version % 2:
-                    made.finish()
+                    made.bring_log_in()
             with opened(other) as again:
-                again.begin_run()
                 for key in KEYS:
                     assert version_of(again, key) or key in again.lost, (version, key)
                     again.save(key, chunk(again, key, 1000))
@@ -379,7 +376,6 @@ def stored(directory: Path, chunks: int, rng: random.Random) -> dict[ChunkKey, b
     saved: dict[ChunkKey, bytes] = {}
     keys = [ChunkKey(number % 40, number // 40, -1) for number in range(chunks)]
     with opened(directory) as made:
-        made.begin_run()
         for version in (1, 2):
             rng.shuffle(keys)
             for key in keys[: chunks // version]:
@@ -400,7 +396,6 @@ def check_after_damage(
 ) -> None:
     """What is not there has a name, and is not much; the map goes on, also over its next start."""
     with opened(directory) as made:
-        made.begin_run()
         found = loaded(made, saved)
         lost = {key for key, data in found.items() if data != saved[key]}
         assert len(lost) <= most, what
@@ -472,7 +467,6 @@ def killed(directory: Path, rng: random.Random) -> dict[ChunkKey, bytes]:
     good = directory.with_name("good")
     saved = stored(good, 24, rng)
     with opened(good) as made:
-        made.begin_run()
         for version in (3, 4):
             for key in rng.sample(sorted(saved), 12):
                 del saved[key]
@@ -561,7 +555,7 @@ def test_a_database_that_is_shorter_or_no_database(tmp_path: Path, any_body: Non
         damaged = change(file.read_bytes())
         file.write_bytes(damaged)
         with opened(tmp_path / name) as made:
-            assert made.begin_run() > 1, "its record is in the copy"
+            assert made.record.runs > 1, "its record is in the copy"
             assert list(made.damaged) == ["map.db.damaged.1"]
             assert all(data == saved[key] for key, data in loaded(made, made.rows).items())
         assert (tmp_path / name / "map.db.damaged.1").read_bytes() == damaged
@@ -570,17 +564,16 @@ def test_a_database_that_is_shorter_or_no_database(tmp_path: Path, any_body: Non
 def test_the_record_is_in_the_copy_where_the_first_page_is_damaged(tmp_path: Path) -> None:
     """And the other way round; without either the map is not opened, and nothing is changed."""
     with opened(tmp_path) as made:
-        made.begin_run()
         made.add_mapper(1000, "front")
         map_id = made.map_id
     damage_page(tmp_path, 1, bytes(PAGE))
     with opened(tmp_path) as again:
-        assert (again.map_id, [one.name for one in again.mappers]) == (map_id, ["front"])
-        assert again.begin_run() == 2
+        assert (again.map_id, [one.name for one in again.record.mappers]) == (map_id, ["front"])
+        assert again.record.runs == 2
     for text in (b"{", b"[" * 200_000, b"\xff", b""):
         (tmp_path / "map.json").write_bytes(text)
         with opened(tmp_path) as again:
-            assert (again.map_id, [one.name for one in again.mappers]) == (map_id, ["front"])
+            assert (again.map_id, [one.name for one in again.record.mappers]) == (map_id, ["front"])
     (tmp_path / "map.json").write_bytes(b"{")
     (tmp_path / "map.db").write_bytes(bytes(10 * PAGE))
     before = files_of(tmp_path)
