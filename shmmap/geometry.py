@@ -231,5 +231,6 @@ def distance_to_boxes(x: float, y: float, boxes: Floats) -> Floats:
     """Return the distance from a point to the nearest point of each box ((N, 4) float64), (N,) metres."""
     dx = np.maximum(np.maximum(boxes[:, 0] - x, x - boxes[:, 2]), 0.0)
     dy = np.maximum(np.maximum(boxes[:, 1] - y, y - boxes[:, 3]), 0.0)
-    distance: Floats = np.hypot(dx, dy)
+    with np.errstate(over="ignore"):  # infinitely far
+        distance: Floats = np.hypot(dx, dy)
     return distance

@@ -38,7 +38,7 @@ from shmmap.doctor.published import (
     check_versions,
 )
 from shmmap.doctor.verdicts import Finding, skip
-from shmmap.errors import ShmmapError
+from shmmap.errors import NotPermitted, ShmmapError
 from shmmap.segment.names import DEFAULT_SHM_DIR, usual_directory
 from shmmap.statistics.reader import read_statistics
 
@@ -79,11 +79,13 @@ def examine(config: DaemonConfig, file: str) -> Diagnosis:
     if config.shm_dir == DEFAULT_SHM_DIR:
         config = dataclasses.replace(config, shm_dir=usual_directory(config.instance))
     try:
-        seen, unreadable = read_statistics(config.instance, config.shm_dir), ""
+        seen, unreadable = read_statistics(config.instance, config.shm_dir), ("", "")
+    except NotPermitted as error:
+        seen, unreadable = None, (error.message, "join its group, or run it with sudo")
     except ShmmapError as error:
-        seen, unreadable = None, error.message
+        seen, unreadable = None, (error.message, error.hint or "restart the daemon")
     except OSError as error:
-        seen, unreadable = None, f"{config.shm_dir}: {error.strerror}"
+        seen, unreadable = None, (f"{config.shm_dir}: {error.strerror}", "see to that directory")
     if seen is not None and seen.identity is not None:
         with closing(DaemonLists("shmmap doctor")) as lists:
             lists.add_to(seen, clients=bool(seen.identity.live))

@@ -32,7 +32,7 @@ _CHUNK: Final = re.compile(r"shmmap-live\.([A-Za-z0-9_-]{1,64})\.[A-Za-z0-9_-]{1
 def check_daemon(diagnosis: Diagnosis) -> Finding:
     """Check that the daemon runs, answers and matches the installed version."""
     if diagnosis.seen is None:
-        return warn(diagnosis.unreadable, "join its group, or run it with sudo")
+        return warn(*diagnosis.unreadable)
     identity = diagnosis.seen.identity
     instance = diagnosis.config.instance
     if diagnosis.awaits_first_client:

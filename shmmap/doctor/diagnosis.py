@@ -54,8 +54,8 @@ class Diagnosis:
     """Configuration file of the settings; empty: none."""
     socket: str
     seen: Snapshot | None
-    """Statistics of the daemon; None if they are unreadable, which ``unreadable`` explains."""
-    unreadable: str = ""
+    """Statistics of the daemon; None if they are unreadable: ``unreadable`` is why, and what to do."""
+    unreadable: tuple[str, str] = ("", "")
     uid: int = field(default_factory=os.geteuid)
     answering: int = 0
     """Process id of a daemon that answers for this instance but has no statistics; 0: none."""

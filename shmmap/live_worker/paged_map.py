@@ -170,6 +170,8 @@ class PagedMap:
         Problems that keep chunks from being loaded or saved at present.
     saved_s : float
         When a file was written or flushed last.
+    record_retry_s : float
+        Before then the record is not written again, because that has failed.
     """
 
     def __init__(
@@ -188,7 +190,7 @@ class PagedMap:
         self.chunks: dict[ChunkKey, ChunkFile] = {}
         self.stored = KeyIndex(database.rows)
         self.problems: dict[str, str] = {}
-        self.saved_s = -math.inf
+        self.saved_s = self.record_retry_s = -math.inf
         self.changes = Changes(time.time_ns())
         self._observer = observer
         self._codec = codec
@@ -506,9 +508,11 @@ class PagedMap:
         self.on_disk(partial(self.database.write_record, applied), self._recorded)
 
     def _recorded(self, future: Future[None], now_s: float) -> None:
-        del now_s
-        if error := future.exception():
-            log.warning("record of a live map not written", reason=str(error))
+        error = future.exception()
+        if error is not None:
+            self.record_retry_s = now_s + RETRY_S
+        reason = _reason(error) if isinstance(error, OSError | MemoryError) else error
+        self._note("recorded", f"its record cannot be written: {reason}" if error is not None else "")
 
     # --- the end --------------------------------------------------------------------------------
 

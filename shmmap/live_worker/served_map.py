@@ -349,7 +349,7 @@ class ServedMap:
             self._answer_saves()
         self.readers.run_turn(now_s)
         due = now_s >= self._record_s and self.paged.changes.number != self._recorded
-        if due or self.paged.database.record_is_due:
+        if due or (self.paged.database.record_is_due and now_s >= self.paged.record_retry_s):
             self.paged.database.record_is_due = False
             self._record_s, self._recorded = now_s + RECORD_S, self.paged.changes.number
             self.paged.write_record(self._durable_scans())
@@ -360,7 +360,8 @@ class ServedMap:
         first_fits = bool(self._waiting) and residency.has_room(self._waiting[0][2].bytes)
         if first_fits or residency.is_ready:
             return now_s
-        return min(residency.next_event_s(now_s), self.readers.next_turn_s(now_s))
+        record_s = self.paged.record_retry_s if self.paged.database.record_is_due else math.inf
+        return min(residency.next_event_s(now_s), self.readers.next_turn_s(now_s), record_s)
 
     def status(self) -> messages.LiveMapRow:
         """Return the state of the map."""

@@ -39,6 +39,7 @@ _FLOAT = re.compile(r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
 _INT32 = range(-(2**31), 2**31)
 _RESOLUTIONS = (b"x_resolution", b"y_resolution")
 _FARTHEST_M = 1e12
+_BELOW = f"below {_FARTHEST_M:g} m"
 _FLUSH_ENTRIES = 1 << 14
 _NAMED_IN_PROBLEMS = 3
 _MAX_DIGITS = 64
@@ -408,7 +409,7 @@ class _EventReader:
                 return
             if key in ("x_resolution", "y_resolution"):
                 raise self._refusal(
-                    f"{key} must be a positive number of metres, not {shortened(value)!r}",
+                    f"{key} must be a positive number of metres, not {shortened(value)!r} ({_BELOW})",
                     mark,
                     "no_resolution",
                 )
@@ -425,11 +426,10 @@ class _EventReader:
         if not entries.entry(name, value[0], value[1]):
             if len(name) > MAX_NAME_BYTES:
                 raise self._refusal(f"{key}: no file has so long a name", mark, "bad_corner")
-            kind = "integers" if entries.strict else "numbers"
+            kind, limit = ("integers", "of 32 bits") if entries.strict else ("numbers", _BELOW)
+            corner = ", ".join(map(shortened, value[:2]))
             raise self._refusal(
-                f"{key}: the corner must be two {kind}, not [{', '.join(map(shortened, value[:2]))}]",
-                mark,
-                "bad_corner",
+                f"{key}: the corner must be two {kind}, not [{corner}] ({limit})", mark, "bad_corner"
             )
 
 

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from xxhash import xxh3_128_hexdigest
 
+from shmmap.dividing.inputs import check_output_directory
 from shmmap.dividing.settings import memory_left
 from shmmap.dividing.workspace import Workspace
 from shmmap.errors import BadRequest, MapDataError, MapMissing
@@ -93,7 +94,7 @@ def fetch_map(
     Parameters
     ----------
     out
-        The directory to create; it must be missing or empty, unless ``force`` replaces it.
+        The directory to create; it must be missing or empty, or a divided map that ``force`` replaces.
     version
         Version to fetch; None: the current one.
     current
@@ -113,8 +114,7 @@ def fetch_map(
         Another run is writing ``out``.
     """
     out = os.path.abspath(out)
-    if not force and os.path.lexists(out) and not (os.path.isdir(out) and not os.listdir(out)):
-        raise BadRequest(f"{out} exists already", hint="choose another directory, or --force to replace it")
+    check_output_directory(out, force=force)
     if version is None:
         current = current or require_current(store)
     else:
@@ -133,6 +133,7 @@ def fetch_map(
             workspace.save(begun)
         fetched = _Fetch(pages, objects, root, workspace).run(progress)
         step("fetch.whole")
+        check_output_directory(out, force=force)  # it may have come meanwhile
         workspace.publish(replace=force, durable=True)
         step("fetch.renamed")
     progress.done(root.cells)

@@ -153,7 +153,7 @@ def read_record(database: sqlite3.Connection) -> MapRecord:
     try:
         ((text,),) = database.execute("select record from map").fetchall()
         return decode_map(text, DATABASE)
-    except (ValueError, MapDataError) as error:
+    except (TypeError, ValueError, MapDataError) as error:
         raise MapDataError(f"its record is damaged: {error}", path=DATABASE, cause=TABLES_DAMAGED) from error
 
 

@@ -53,9 +53,11 @@ class ConditionalStore(Protocol):
 
 
 def ask_conditions(store: ConditionalStore) -> None:
-    """Raise an error if a store does not write on conditions, by four requests for one small object.
+    """Raise an error if a store does not write on conditions, by five requests for one small object.
 
-    The content of each write is unique, so that several publishers can ask at the same time.
+    The content of each write is unique, so that several publishers can ask at the same time.  The tag that a
+    condition names is that of a read, as when a version is replaced: a proxy may change it, or that of a
+    write.
 
     Raises
     ------
@@ -67,11 +69,17 @@ def ask_conditions(store: ConditionalStore) -> None:
     outcomes: list[_Outcome] = []
     for _ in range(_ROUNDS):
         first, second = asked_content(), asked_content()
-        tag = _written(store, first)
-        is_replaced = _conditional(store, second, only_if=tag) is not None
-        outcome: _Outcome = "replaced" if is_replaced else _after_refusal(store, first, second, tag)
-        if outcome != "kept":  # now the tag is of an earlier state
-            _refuse_ignored(store, tag)
+        earlier = _written(store, first)
+        seen = refuse_foreign(store)
+        refuse_unsafe_tag(store.url, seen.tag)
+        outcome: _Outcome = "another's"
+        if seen.data == first:
+            is_replaced = _conditional(store, second, only_if=seen.tag) is not None
+            outcome = "replaced" if is_replaced else _after_refusal(store, first, second)
+        if outcome == "another's":
+            _written(store, asked_content())  # what was read may have been an old state
+        if outcome != "kept":
+            _refuse_ignored(store, earlier)
         if outcome == "replaced":
             return
         outcomes.append(outcome)
@@ -135,11 +143,6 @@ def _written(store: ConditionalStore, data: bytes) -> Tag:
             hint=_NEEDED,
         ) from None
     assert tag is not None  # noqa: S101  there was no condition
-    try:
-        refuse_unsafe_tag(store.url, tag)
-    except CannotWrite:
-        refuse_foreign(store)
-        raise
     return tag
 
 
@@ -163,14 +166,9 @@ def _conditional(
     )
 
 
-def _after_refusal(store: ConditionalStore, first: bytes, second: bytes, tag: Tag) -> _Outcome:
+def _after_refusal(store: ConditionalStore, first: bytes, second: bytes) -> _Outcome:
     """Return what has become of the object after the store has refused to replace ``first`` by ``second``."""
     seen = refuse_foreign(store)
-    if seen.data == first and seen.tag.get("e_tag") not in (None, tag.get("e_tag")):
-        refuse_unsafe_tag(store.url, seen.tag)
-        if _conditional(store, second, only_if=seen.tag) is not None:
-            return "replaced"
-        seen = refuse_foreign(store)
     if seen.data == second:  # the answer to an earlier attempt was lost
         return "replaced"
     return "kept" if seen.data == first else "another's"

@@ -538,7 +538,14 @@ def test_fetched_files_have_every_field_bit_by_bit(
     assert (done["version"], done["cells"], done["fetched_cells"], done["points"]) == (1, 4, 4, 1200)
     assert files_of(tmp_path / "back/pointcloud_map.pcd") == files_of(town.pcd_dir)
     assert not shmmap.json("publish", tmp_path / "back", folder / "town")["changed"]
-    assert "exists already" in shmmap("fetch", f"{url}/town", tmp_path / "back", code=2)
+    assert "is a map already" in shmmap("fetch", f"{url}/town", tmp_path / "back", code=2)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/thesis").write_text("mine")
+    (tmp_path / "link").symlink_to(tmp_path / "back")
+    for odd, why in (("mine", "is not a divided map"), ("mine/thesis", "is no"), ("link", "is no")):
+        for force in ((), ("--force",)):
+            assert why in shmmap("fetch", f"{url}/town", tmp_path / odd, *force, code=2)
+    assert (tmp_path / "mine/thesis").read_text() == "mine"
     town.change("0_0.pcd", seed=3)
     shmmap("publish", town.root, folder / "town")
     shmmap("fetch", f"{url}/town", tmp_path / "back", "--force")

@@ -7,6 +7,7 @@ import dataclasses
 import grp
 import os
 import socket
+import struct
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,6 +24,7 @@ from shmmap.doctor.verdicts import Finding, cache_verdict, worst
 from shmmap.live_settings import LiveSettings
 from shmmap.protocol.rows import ClientRow, LiveMapRow
 from shmmap.statistics.counters import COUNTER_NAMES, REFUSALS
+from shmmap.statistics.layout import MAGIC
 from shmmap.statistics.reader import Snapshot
 from tests.support.divided_map import make_map
 from tests.unit.doctor.conftest import USER, Ward, snapshot
@@ -635,8 +637,20 @@ def test_a_map_in_a_home_directory(tmp_path: Path, ward: Ward, monkeypatch: pyte
 )
 def test_the_daemon(ward: Ward, seen: Snapshot | None, state: str) -> None:
     """Without its statistics if they are another user's."""
-    diagnosis = dataclasses.replace(ward.diagnosis(), seen=seen, unreadable="no")
+    diagnosis = dataclasses.replace(ward.diagnosis(), seen=seen, unreadable=("no", "so"))
     assert daemon.check_daemon(diagnosis).state == state
+
+
+def test_statistics_of_another_version_or_of_another_program(tmp_path: Path) -> None:
+    """The advice is about them, not about permissions."""
+    file = tmp_path / "shmmap.one.statistics"
+    file.write_bytes(MAGIC + struct.pack("<HH", 2, 0) + bytes(8192))
+    found = daemon.check_daemon(examine(DaemonConfig(instance="one", shm_dir=str(tmp_path)), ""))
+    assert (found.state, found.advice) == ("warn", "update the daemon, and restart it")
+    assert "of an older daemon" in found.fact
+    file.write_bytes(b"x")
+    found = daemon.check_daemon(examine(DaemonConfig(instance="one", shm_dir=str(tmp_path)), ""))
+    assert (found.state, found.advice) == ("warn", "restart the daemon")
 
 
 def test_leftovers(ward: Ward) -> None:

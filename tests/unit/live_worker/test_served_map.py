@@ -438,6 +438,29 @@ def test_the_record_is_written_once_a_minute(serve: Serve, monkeypatch: pytest.M
     assert min(b - a for a, b in pairwise(times_s)) >= served_map.RECORD_S
 
 
+def test_a_record_that_cannot_be_written_is_tried_again_later(
+    serve: Serve, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """By itself, and one line of the log says so."""
+    one = serve(**LATER)
+    one.open()
+    database = one.paged.database
+    with monkeypatch.context() as patch:
+        calls = fail(patch, database, "flush", errno.ENOSPC)
+        database.record_is_due = True
+        one.until(lambda: one.map.status().problem)
+        start_s, before = one.now_s, len(calls)
+        for _ in range(50):
+            one.turn()
+            one.paged._threads.wait(0.01)
+        assert 2 <= len(calls) - before <= 2 + (one.now_s - start_s), "once a second"
+        assert one.map.next_turn_s(one.now_s) <= one.now_s + 1.0
+        assert one.map.status().problem == "its record cannot be written: No space left on device"
+    one.until(lambda: not one.map.status().problem)
+    assert not database.record_is_due
+    assert caplog.text.count("its record cannot be written") == 1
+
+
 # --- sleeping -----------------------------------------------------------------------------------
 
 

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 _EPILOG = """\
 URL is s3://BUCKET/PATH, gs://BUCKET/PATH, az://CONTAINER/PATH, file:///DIR or a directory, which any web
 server can serve.  Credentials come from the environment, from $CREDENTIALS_DIRECTORY, or from a profile.
-The store is asked first whether it writes on conditions, by four small writes: of two publishers at once,
+The store is asked first whether it writes on conditions, by five small requests: of two publishers at once,
 one must be refused.  --sole-publisher does without.
 Only what the current version does not have is sent.  The new version becomes current at once, at the end; a
 stopped run, started again, sends only what is missing.

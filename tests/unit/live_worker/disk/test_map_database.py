@@ -574,6 +574,13 @@ def test_the_record_is_in_the_copy_where_the_first_page_is_damaged(tmp_path: Pat
         (tmp_path / "map.json").write_bytes(text)
         with opened(tmp_path) as again:
             assert (again.map_id, [one.name for one in again.record.mappers]) == (map_id, ["front"])
+    for value in ("null", "7", "0.5", "x'ff'", "'{'"):  # by one byte of the row's header, or of its text
+        with opened(tmp_path) as made:
+            made.write_record()
+        with database(tmp_path) as writer:
+            writer.execute(f"update map set record = {value}")
+        with opened(tmp_path) as again:
+            assert (again.map_id, [one.name for one in again.record.mappers]) == (map_id, ["front"])
     (tmp_path / "map.json").write_bytes(b"{")
     (tmp_path / "map.db").write_bytes(bytes(10 * PAGE))
     before = files_of(tmp_path)

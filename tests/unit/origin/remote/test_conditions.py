@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a store can do is asked before anything is sent: four requests distinguish what stores fail to do."""
+"""What a store can do is asked before anything is sent: five requests distinguish what stores fail to do."""
 
 from __future__ import annotations
 
@@ -71,16 +71,21 @@ def quick(tag: str) -> str:
     return tag[:-2] + '-x"'
 
 
+def zipped(tag: str) -> str:
+    """Name it as Apache does while it compresses."""
+    return tag[:-1] + '-gzip"'
+
+
 def swallowed(asked: Asked, forward: Forward) -> Answer:
     """Say that it was written."""
     return Answer(200, {"etag": f'"{hash(asked.body)}"'}) if asked.method == "PUT" else forward(asked)
 
 
-def test_a_good_store_is_asked_four_times_once(proxy: Proxy) -> None:
+def test_a_good_store_is_asked_five_times_once(proxy: Proxy) -> None:
     store = proxy.opened()
     for _ in range(3):
         store.require_conditions()
-    assert proxy.requests() == [("PUT", proxy.path)] * 4
+    assert proxy.requests() == [(method, proxy.path) for method in ("PUT", "GET", "PUT", "PUT", "PUT")]
     assert store.put_new("CURRENT", b"one")
     _, tag = store.get_tagged("CURRENT", 9)
     store.require_conditions(tag)
@@ -101,6 +106,11 @@ BAD: dict[str, tuple[Rule, type[ShmmapError], str]] = {
     ),
     "no ETag": (with_tags(gone, "PUT", "GET", "HEAD"), CannotWrite, "gives no ETags"),
     "no ETag of writes": (with_tags(gone, "PUT"), CannotWrite, "gives no ETags"),
+    "other ETags of reads": (
+        with_tags(zipped, "GET"), CannotWrite, "does not replace an object whose ETag",
+    ),
+    "weak ETags of reads": (with_tags(weak, "GET"), CannotWrite, "gives weak ETags"),
+    "reads without tags": (with_tags(gone, "GET"), CannotWrite, "gives no ETags"),
     "other ETags": (with_tags(quick, "PUT", "GET"), CannotWrite, "does not replace an object whose ETag"),
     "501": (conditional(501), CannotWrite, r"takes no writes on conditions \(refused \(status 501\)\)"),
     "400": (
@@ -137,15 +147,16 @@ def test_what_fails_is_named_and_nothing_but_the_question_is_sent(proxy: Proxy, 
 
 def test_etags_that_only_writes_have_weak_are_the_objects_own(proxy: Proxy) -> None:
     """A store whose replies to writes name another tag than an object gets is good."""
-    proxy.rule = with_tags(quick, "PUT")
-    proxy.opened().require_conditions()
+    for change in (quick, weak):
+        proxy.rule = with_tags(change, "PUT")
+        proxy.opened().require_conditions()
 
 
 def test_a_tag_that_only_reading_weakens(proxy: Proxy) -> None:
     store = proxy.opened()
     store.put_new("CURRENT", b"one")
-    proxy.rule = with_tags(weak, "GET", "HEAD")
     store.require_conditions()
+    proxy.rule = with_tags(weak, "GET", "HEAD")
     _, tag = store.get_tagged("CURRENT", 9)
     for ask in (lambda: store.require_conditions(tag), lambda: store.put_if("CURRENT", b"two", tag)):
         with pytest.raises(CannotWrite, match="gives weak ETags: a version cannot be replaced safely"):
@@ -189,7 +200,7 @@ def test_between_any_two_steps_of_one_comes_another(proxy: Proxy) -> None:
 
     proxy.rule = between(honest)
     proxy.opened().require_conditions()
-    assert len(proxy.requests()) == 5 * (4 + 1)
+    assert len(proxy.requests()) == 5 * 5
     for name in ("no If-Match", "no If-None-Match", "neither", "501", "weak"):
         rule, kind, says = BAD[name]
         proxy.rule = between(rule)
