@@ -71,6 +71,7 @@ def interleaved(
     lock
         Attribute with the lock.
     """
+    sys._getframe().f_trace_opcodes = True  # Python 3.12 has to know before `sys.settrace`
     tracing, number = sys.gettrace(), 0
     while True:
         number += 1
