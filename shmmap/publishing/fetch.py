@@ -12,7 +12,6 @@ import json
 import mmap
 import os
 import secrets
-import threading
 from collections.abc import Iterable
 from dataclasses import dataclass
 from types import TracebackType
@@ -271,7 +270,6 @@ class _Finished:
     def __init__(self, path: str) -> None:
         fd = open_own(path, os.O_RDWR | os.O_CREAT | os.O_APPEND)
         self._file = open(fd, "r+b", buffering=0)  # noqa: SIM115  closed by __exit__
-        self._lock = threading.Lock()
         self._digests: dict[str, str] = {}
         for line in self._file.readall().split(b"\n"):
             with contextlib.suppress(ValueError):
@@ -300,8 +298,7 @@ class _Finished:
 
     def add(self, name: str, digest: str) -> None:
         """Note a finished file."""
-        with self._lock:
-            self._file.write(b"\n" + json.dumps([name, digest]).encode() + b"\n")
+        self._file.write(b"\n" + json.dumps([name, digest]).encode() + b"\n")  # at once, whatever others add
 
 
 def _digest_of(path: str) -> str:

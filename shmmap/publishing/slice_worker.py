@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import socket
 import sys
-import threading
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
@@ -138,11 +137,9 @@ def _work(channel: socket.socket, argument: str) -> None:
     if settings.cache_bytes:
         cache = LayerCache(settings.cache_dir, limit_bytes=settings.cache_bytes)
         tier = ObjectTier(settings.cache_dir, limit_bytes=settings.cache_bytes)
-    sending = threading.Lock()
 
     def send(message: CellSent | NotSent) -> None:
-        with sending:
-            channel.send(encode(message))
+        channel.send(encode(message))  # a whole packet, whatever other threads send
 
     sender = Sender(store, send, is_first=False)
     channel.send(encode(Ready()))

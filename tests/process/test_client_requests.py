@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import gc
 import os
 import signal
@@ -22,8 +23,9 @@ import pytest
 import zmq
 
 import shmmap
+import shmmap.aio
 from shmmap.client import connection, map_listing
-from shmmap.client.connection import program_name
+from shmmap.client.connection import _Exchange, program_name
 from shmmap.errors import (
     BadRequest,
     LoadFailed,
@@ -691,6 +693,67 @@ def test_one_client_in_many_threads(standing: DaemonProcess, standing_map: Divid
 
         with ThreadPoolExecutor(6) as pool:
             assert all(pool.map(ask, range(6)))
+
+
+class OwnedLock:
+    """A lock that knows which thread holds it."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self.owner = 0
+
+    def __enter__(self) -> None:
+        self._lock.acquire()
+        self.owner = threading.get_ident()
+
+    def __exit__(self, *_error: object) -> None:
+        self.owner = 0
+        self._lock.release()
+
+    def locked(self) -> bool:
+        return self._lock.locked()
+
+
+def test_a_socket_is_used_by_one_thread_at_a_time(
+    standing: DaemonProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also by those that begin, end or take over a connection."""
+    make, add, used = _Exchange.__init__, _Exchange.add, set[tuple[str, bool]]()
+
+    def note(what: str, lock: OwnedLock) -> None:
+        used.add((what, lock.owner == threading.get_ident()))
+
+    class Watched:
+        def __init__(self, socket: Any, lock: OwnedLock) -> None:
+            self._socket, self._of = socket, lock
+
+        def __getattr__(self, name: str) -> Any:
+            note(name, self._of)
+            return getattr(self._socket, name)
+
+    def made(exchange: Any, watch: Any, *of: Any) -> None:
+        watch.lock = OwnedLock()
+        make(exchange, watch, *of)
+        exchange.socket = Watched(exchange.socket, exchange.lock)
+
+    def added(exchange: Any, *entry: Any, **sent: Any) -> None:
+        note("add", exchange.lock)
+        add(exchange, *entry, **sent)
+
+    monkeypatch.setattr(_Exchange, "__init__", made)
+    monkeypatch.setattr(_Exchange, "add", added)
+
+    async def ask() -> None:
+        async with shmmap.aio.connect(standing.endpoint, timeout=LONG_S) as client:
+            await client.around(0, 0, 30)
+
+    with shmmap.connect(standing.endpoint, timeout=LONG_S) as client:
+        client.around(0, 0, 30)
+        assert client.release() > 0
+        client.futures.around(0, 0, 30).result(LONG_S)
+    asyncio.run(ask())
+    calls = ("add", "send", "recv", "setsockopt", "getsockopt")
+    assert used == {(call, True) for call in calls}
 
 
 FORK = """

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from shmmap.disk_budget import DiskBudget, mark_used
+from tests.support.interleaving import interleaved
 
 PLACES = {"layer": "layers/version/ab", "cell": "objects/cells/ab", "page": "objects/index/ab"}
 HOUR_S = 3600.0
@@ -80,6 +81,14 @@ def test_small_files_count_what_they_take_on_the_disk(here: Directory) -> None:
     assert 0 < len(here.left()) <= 4
     of_small = DiskBudget(str(here.path), 256 * BLOCK)
     assert [of_small.added(1) for _ in range(5)] == [False] * 4 + [True]
+
+
+def test_files_that_are_added_at_the_same_time_all_count(here: Directory) -> None:
+    def add(budget: DiskBudget) -> None:
+        assert not budget.added(2 * BLOCK)
+
+    for budget in interleaved(lambda: DiskBudget(str(here.path), 256 * BLOCK), add, add):
+        assert budget.added(1), "now it is more than 1/64 of the budget"
 
 
 def test_both_names_of_a_layer_are_one_file(here: Directory) -> None:

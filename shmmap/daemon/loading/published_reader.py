@@ -181,9 +181,8 @@ class ObjectFetcher:
 
     def get(self, name: ObjectName) -> memoryview:
         """Return an object that was fetched for the current job, or fetch it now."""
-        with self._lock:
-            fetch = self._fetches.get(name.sha256)
-            frame = fetch.frame if fetch is not None else None
+        fetch = self._fetches.get(name.sha256)
+        frame = fetch.frame if fetch is not None else None
         if isinstance(frame, ShmmapError):
             raise frame
         return frame if frame is not None else _get(self._objects, name)

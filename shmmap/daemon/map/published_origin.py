@@ -290,8 +290,7 @@ class PublishedOrigin:
         except MapDataError as error:  # for example, written by a later version of shmmap
             log.warning("the version taken last cannot be served", reason=error)
             return None
-        with self._lock:
-            self.taken = self._saved = taken
+        self.taken = self._saved = taken
         return taken, root
 
     def _restored(self, taken: TakenVersion, root: Root) -> PublishedView:

@@ -186,6 +186,7 @@ def test_a_request_whose_time_is_up_is_answered_in_turn(inner: Inner, small_map:
     finish(one.due[0])
     ((_, reply),) = one.replies
     assert [cell.id for cell in reply.pending] == ["0_0.pcd"]
+    assert 6e9 <= one.statistics._durations["wait"][0] < 60e9, "nanoseconds"
 
 
 def test_cells_of_one_request(inner: Inner, small_map: DividedMap, monkeypatch: pytest.MonkeyPatch) -> None:

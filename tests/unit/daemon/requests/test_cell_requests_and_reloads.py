@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import mmap
 from pathlib import Path
+from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -75,6 +76,25 @@ def test_a_file_replaced_before_the_loader_comes_to_it(inner: Inner, small_map: 
     assert reply.cells[0].version == page.rows[0].version  # type: ignore[union-attr]
     one.reload()
     assert one.cache.catalogue.version(one.cache.index_of("0_0.pcd") or 0) == reply.cells[0].version
+
+
+def test_a_file_replaced_after_the_loader_has_read_it(
+    inner: Inner, small_map: DividedMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The daemon knows of it before the segment comes: none is published, and the cell is loaded again."""
+    one = inner(small_map.root)
+    publish = one.scheduler._publish
+
+    def changed_meanwhile(*done: Any) -> None:
+        if one.statistics.values["loads_started"] == 1:
+            rewrite(small_map, "0_0.pcd", 33)
+            one.reload()
+        publish(*done)
+
+    monkeypatch.setattr(one.scheduler, "_publish", changed_meanwhile)
+    reply = one.cells_for(Selected(1, ("0_0.pcd",), wait=30.0))
+    assert [(cell.points, cell.stale) for cell in reply.cells] == [(33, False)]
+    assert [one.statistics.values[name] for name in ("loads_started", "loads_finished")] == [2, 1]
 
 
 def test_what_changed_since_a_state_of_the_map_is_found_once_for_all_pages(

@@ -29,7 +29,7 @@ from shmmap.live_worker.disk.folder import Folder, FolderToRead
 from shmmap.live_worker.disk.maintenance import check
 from shmmap.live_worker.disk.map_database import SCANS_AHEAD, MapDatabase
 from shmmap.live_worker.disk.map_record import MapSettings, Row
-from shmmap.live_worker.disk.rebuilding import finish_replacing, replace_database
+from shmmap.live_worker.disk.rebuilding import NEW, finish_replacing, replace_database
 from shmmap.mounts import Mount
 from tests.support.odd_files import ODD_FILES, failing
 from tests.support.pages import read_page
@@ -104,6 +104,20 @@ def test_a_map_is_made_and_found_again(tmp_path: Path) -> None:
         assert again.record.applied == {1: 7}
         assert [version_of(again, key) for key in KEYS] == [3, 1, 0]
         assert (again.lost, again.damaged) == ({}, {})
+
+
+def test_a_database_is_on_the_disk_before_it_gets_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flush, flushed = os.fdatasync, list[str]()
+
+    def noted(fd: int) -> None:
+        flushed.append(os.readlink(f"/proc/self/fd/{fd}"))
+        flush(fd)
+
+    monkeypatch.setattr(os, "fdatasync", noted)
+    with opened(tmp_path / "map"):
+        assert flushed[0] == str(tmp_path / "map" / NEW)
 
 
 @pytest.mark.parametrize(

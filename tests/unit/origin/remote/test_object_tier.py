@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import logging
 import os
@@ -24,10 +25,12 @@ from shmmap.origin.remote.object_tier import KeptObjects, ObjectCounts, ObjectTi
 from shmmap.origin.remote.opened_store import DirectoryStore
 from shmmap.origin.remote.published_object import blob_path
 from shmmap.statistics.counters import OBJECTS_READ
+from tests.support.interleaving import interleaved
 from tests.support.map_stores import wait_for_trimming
 
 DATA = random.Random(1).randbytes(20_000)
 NAME = hashlib.sha256(DATA).digest()
+OTHER = bytes(32)
 DAY_S = 86_400
 
 
@@ -237,6 +240,30 @@ def test_no_descriptor_is_left_open(cache: Path, tier: ObjectTier) -> None:
     assert len(os.listdir("/proc/self/fd")) <= before
 
 
+def test_damage_that_is_found_at_the_same_time_all_counts(cache: Path, tier: ObjectTier) -> None:
+    def damaged() -> ObjectTier:
+        for name in (NAME, OTHER):
+            tier.put(name, DATA[1:])
+        return ObjectTier(str(cache), limit_bytes=1 << 30)
+
+    def read(name: bytes) -> Callable[[ObjectTier], object]:
+        return lambda tier: tier.get(name, len(DATA))
+
+    for one in interleaved(damaged, read(NAME), read(OTHER)):
+        assert one.damaged_objects == 2
+
+
+def test_what_two_threads_find_at_the_same_time_is_said_once(
+    cache: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    def say(tier: ObjectTier) -> None:
+        tier._say(OSError(errno.ENOSPC, "no space"))
+
+    for _ in interleaved(lambda: ObjectTier(str(cache), limit_bytes=1), say, say):
+        assert caplog.text.count("objects not kept on disk") == 1
+        caplog.clear()
+
+
 # --- whose it is --------------------------------------------------------------------------------------
 
 
@@ -437,6 +464,45 @@ def test_what_is_kept_while_the_directory_is_trimmed_is_trimmed_too(
     assert sum(path.stat().st_size for path in cache.rglob("*") if path.is_file()) <= 100_000
 
 
+class Trimmer:
+    """A thread that trims, which has begun or will begin."""
+
+    def __init__(self, target: Callable[[], None] | None = None, **_options: object) -> None:
+        self.target = target
+
+    def start(self) -> None:
+        """Wait: `target` is for the test to call."""
+
+    def is_alive(self) -> bool:
+        return True
+
+
+def test_what_is_kept_as_the_trimming_ends_is_trimmed_too(
+    cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(threading, "Thread", Trimmer)
+    done: list[str] = []
+    monkeypatch.setattr(DiskBudget, "trim", lambda _budget: done.append("trimmed"))
+
+    def trimming() -> ObjectTier:
+        tier = ObjectTier(str(cache), limit_bytes=1)
+        tier._begin_to_trim()
+        return tier
+
+    def keep(tier: ObjectTier) -> None:
+        before = tier._trimmer
+        done.append("kept")
+        tier._begin_to_trim()
+        if tier._trimmer is not before:
+            tier._trim()
+
+    for first, second in ((ObjectTier._trim, keep), (keep, ObjectTier._trim)):
+        for tier in interleaved(trimming, first, second):
+            assert done[-1] == "trimmed"
+            assert tier._trimmer is None
+            done.clear()
+
+
 def test_the_pages_of_the_version_in_use_stay(cache: Path) -> None:
     """Pages read long ago are marked as used when a version comes that has them too."""
     tier = ObjectTier(str(cache), limit_bytes=5 * 4 * 4096)
@@ -452,6 +518,14 @@ def test_the_pages_of_the_version_in_use_stay(cache: Path) -> None:
         wait_for_trimming()
     left = [tier.get(name, 4096, is_index=True) is not None for name in names]
     assert left == [True, True, False, False, False, True, True, True]
+
+
+def test_reads_at_the_same_time_all_count(origin: Origin) -> None:
+    def read(objects: KeptObjects) -> None:
+        objects.read(NAME, len(DATA))
+
+    for objects in interleaved(lambda: KeptObjects(origin, None), read, read):
+        assert objects.counts == ObjectCounts(fetched_objects=2, fetched_bytes=2 * len(DATA))
 
 
 def test_counts_are_those_that_the_statistics_have(origin: Origin, tier: ObjectTier, cache: Path) -> None:
