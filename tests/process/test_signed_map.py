@@ -398,7 +398,8 @@ def test_a_rotation_killed_anywhere_leaves_a_valid_map(
 
     def taken(version: int) -> bool:
         """Whether a vehicle that trusts the first root takes this version."""
-        return verify_version(open_store(str(store)), first, str(tmp_path / "state")).current.version == version
+        verified = verify_version(open_store(str(store)), first, str(tmp_path / "state"))
+        return verified.current.version == version
 
     before = Signed(store, keys).root.signed.roles[role].keyids
     words = ("versions", store, "--rotate", role, "--sign", keys)

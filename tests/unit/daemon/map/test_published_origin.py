@@ -50,8 +50,7 @@ def test_a_version_signed_again_does_not_replace_a_later_one(
         origin._take(taken(2), cast("Any", Root()), {})
 
     def judge(origin: PublishedOrigin) -> None:
-        again = taken(1).current
-        offer = Verified(again.version, again.root, again.bytes, trust="", signed_s=1.0, expires_s=2.0)
+        offer = Verified(taken(1).current, trust="", signed_s=1.0, expires_s=2.0)
         with suppress(MapDataError):  # it is older than the one taken
             origin._judge(offer)
 
