@@ -8,8 +8,8 @@ needed.  No byte passes for 10 s of each minute.  Square blocks of 600 m, 4.2 km
 those of the first minute left out.  ``places`` is as many objects under way as a loader has places for, 32;
 ``budget`` is `shmmap.daemon.loading.link`.  All cells fit in memory, without ``--memory-cells``.
 
-Measured: with the route 100 % either way; without, places 77.9 %, 28.0 s, 488 MB, budget 92.4 %, 14.0 s,
-432 MB; with the route 293 MB.  A scheduler that knows the link and its outages, and looks 12 s ahead,
+Measured: with the route 100 % either way; without, places 79.0 %, 28.0 s, 480 MB, budget 92.9 %, 14.5 s,
+386 MB; with the route 293 MB.  A scheduler that knows the link and its outages, and looks 12 s ahead,
 has 95.3 %, 12.5 s, 358 MB on this drive.
 
 Printed are the share of queries that lack nothing, the longest time in which each lacked something, and the

@@ -11,9 +11,9 @@ and a recorded one, KITTI's odometry sequence 00 (3.7 km), whose poses come with
     python -m tests.benchmarks.slow_origin_simulated --poses /tmp/evo-*/test/data/KITTI_00_gt.txt
 
 Measured with 400 ms a cell and 10 s of outage every 2 minutes, share of warm queries and cells fetched:
-nothing ahead 0 to 24 %; margin 81.8 to 97.7 %, 1.24 to 1.42; no route 94.0 to 99.7 %, 1.18 to 1.60;
+nothing ahead 0 to 24 %; margin 81.8 to 97.7 %, 1.24 to 1.42; no route 93.5 to 99.7 %, 1.15 to 1.61;
 trajectory 97.7 to 100 %, 1.01 to 1.05; route 100 %, 1.01 to 1.05. Outages of 60 s every 5 minutes: no route
-86.3 to 99.4 %, route 100 %. Without outages: no route 98.1 to 100 %.
+86.1 to 100 %, route 100 %. Without outages: no route 98.4 to 100 %.
 
 A vehicle asks for a circle of 200 m every 20 m; cells of 20 m are loaded by eight loaders, each load in a
 log-normal time, and fail in outages.  One row for each policy of fetching ahead:

@@ -108,8 +108,6 @@ LOOK_WORK: Final = 8000
 """Work of finding the cells around a part of a path."""
 CELL_WORK: Final = 150
 """Work of asking whether a cell is missing."""
-USUAL_PASS_S: Final = 2.0
-"""Interval that the look-ahead allows for; it is longer where the interval is longer."""
 STEPS_TOGETHER: Final = 8
 """Steps along a path for which the cells around are found together; fewer where cells are many."""
 ASKED_TOGETHER: Final = 64
@@ -256,12 +254,13 @@ WORK_PER_CALL: Final = 10_000
 """Work after which a call ends: a quarter of a millisecond."""
 SLOW_LOADS: Final = 1.6
 """Consecutive loads that a cell may have to wait for."""
-SLACK_S: Final = 3.0
+SLACK_S: Final = 2.5
 """Margin added to the measured times, since requests and steps along the path are discrete."""
 SPARE: Final = 1.25
 """Factor on the outage's duration: cells used up in one outage are replaced only slowly."""
-AFTER_S: Final = 2.0
-"""Time until loads are known to succeed again after an outage, and the first cells have arrived."""
+AFTER_S: Final = 4.5
+"""Time until loads are known to succeed again after an outage, paths are looked along, and the first cells
+have arrived."""
 GUESSED_S: Final = 10.0
 """Longest time for which a client without a route is assumed to move straight ahead."""
 URGENT_S: Final = 2.0
@@ -346,8 +345,8 @@ class Prefetch:
     @property
     def look_ahead(self) -> LookAhead:
         """Current look-ahead; cells beyond it are not wished for yet."""
-        load_s = SLOW_LOADS * self.health.slow_s + SLACK_S + max(0.0, self._interval_s - USUAL_PASS_S)
-        route_s = load_s + SPARE * self._outage_tolerance_s + USUAL_PASS_S + AFTER_S
+        load_s = SLOW_LOADS * self.health.slow_s + SLACK_S + self._interval_s - PASS_S
+        route_s = load_s + SPARE * self._outage_tolerance_s + AFTER_S
         straight_s = load_s + min(self._outage_tolerance_s, self._away_s, GUESSED_S)
         return LookAhead(route_s, straight_s, load_s)
 

@@ -23,7 +23,6 @@ from shmmap.daemon.loading.look_ahead import (
     PROBE_S,
     READ_PER_CALL,
     SLACK_S,
-    USUAL_PASS_S,
     WORK_PER_CALL,
     ClientPath,
     LookAhead,
@@ -543,7 +542,7 @@ def test_looking_takes_a_twentieth_of_a_core_at_most(clients: int, monkeypatch: 
         assert done * WORK_S <= end_s - begin_s
     ahead = daemon.prefetch.look_ahead
     assert ahead.route_s - alone.route_s == pytest.approx(ahead.sides_s - alone.sides_s)
-    assert (ahead.route_s > alone.route_s) is (passes[-1][1] * WORK_S > USUAL_PASS_S)
+    assert (ahead.route_s > alone.route_s) is (passes[-1][1] * WORK_S > PASS_S)
     assert (len(passes) > 10) is (clients <= 8)
 
 

@@ -61,7 +61,7 @@ def begin(
     nbytes: int = MAX_BYTES // 4,
 ) -> None:
     name = ObjectName(digest, nbytes, 1, b"")
-    monkeypatch.setattr(published_reader, "_needed", lambda _spec, _job: iter([name]))
+    monkeypatch.setattr(published_reader, "needed_objects", lambda _spec, _job: iter([name]))
     fetcher.begin(number, cast("LayerSpec", LAYER), cast("Any", None))
 
 
