@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from shmmap.protocol.rows import ClientRow, LiveMapRow
 
 _ATTEMPTS = 100
-_MOST_HEADER_BYTES = 80 << 10
+_MAX_HEADER_BYTES = 80 << 10
 
 
 class Snapshot:
@@ -211,7 +211,7 @@ def read_statistics(instance: str = "default", shm_dir: str = DEFAULT_SHM_DIR) -
 
 
 def _read_header(fd: int, size: int) -> Header:
-    header = unpack_header(os.pread(fd, _MOST_HEADER_BYTES, 0))
+    header = unpack_header(os.pread(fd, _MAX_HEADER_BYTES, 0))
     if header.end > size:
         raise SegmentCorrupt(f"the statistics claim {header.end} bytes, there are {size}")
     return header
