@@ -24,10 +24,10 @@ from shmmap.daemon.records import Resident
 from shmmap.daemon.travel.places import NOWHERE, PAIRS_PER_BLOCK, Places, Squares, until_needed
 
 MAX_LISTED: Final = 1024
-BLOCK: Final = 64
+BLOCK: Final = 32
 """Segments looked at together; fewer where there are many places."""
-WORK_PER_STEP: Final = 12_000
-"""Work after which a step ends: a quarter of a millisecond."""
+WORK_PER_STEP: Final = 8000
+"""Work after which a step ends: a sixth of a millisecond."""
 LOOK_WORK: Final = 96
 """Work of looking at a segment."""
 LIST_WORK: Final = 256

@@ -24,7 +24,7 @@ from shmmap.protocol.messages import Holder, Intent
 from shmmap.quantities import format_bytes
 from shmmap.segment.pins import MAX_SLOT
 
-MOVES_PER_STEP: Final = 4
+MOVES_PER_STEP: Final = 2
 """Sessions whose motion is updated per step."""
 
 

@@ -356,7 +356,7 @@ def test_of_many_the_first_go_when_all_have_been_looked_at(memory: Memory) -> No
         assert evictor.wake_s == NOW_S
         assert not memory.ledger.retired, "not all have been looked at"
     spare = memory.publish(1)[0]
-    assert evicted(memory, 100, NOW_S) == some[:100]
+    assert evicted(memory, 20, NOW_S) == some[:20]
     assert evictor.next_s == NOW_S + PLAN_S, "there is another segment"
     at_s, steps = NOW_S, 0
     while evictor.next_s < float("inf"):
@@ -366,8 +366,8 @@ def test_of_many_the_first_go_when_all_have_been_looked_at(memory: Memory) -> No
     assert at_s == pytest.approx(NOW_S + PLAN_S + 2.0 * WORK_S * per_step * (LOOK_WORK + LIST_WORK))
     assert evicted(memory, 1, at_s) == [spare]
     last = memory.publish(1)[0]
-    rest = len(some) - 100
-    assert evicted(memory, rest, at_s) == some[100:]
+    rest = len(some) - 20
+    assert evicted(memory, rest, at_s) == some[20:]
     assert evicted(memory, 1, at_s) == [last]
     assert evictor.free(memory.ledger.coming_bytes + 1, at_s) is Freeing.NO_MORE
 
