@@ -31,6 +31,7 @@ MAX_COLD: Final = 1 << 14
 MAX_ENDED: Final = 1024
 """Limit of ended loads noted between two turns; the oldest are dropped."""
 LEARNED_PER_STEP: Final = 64
+"""Ended loads from which one step learns whether the origin answers; the others wait for the next."""
 FOLLOW_S: Final = 0.005
 """How long a few clients' moves may wait, or ended loads while no client moves, to be handled together."""
 KEPT: Final = 4
