@@ -33,7 +33,8 @@ class Resident:
     checksums; until then it is not handed out.  ``prefetched`` is true for a prefetched segment until a
     client asks for it, ``spare`` for one that was loaded into spare memory and only spare requests asked for.
     ``handle`` and ``stale_handle`` are encoded once for all replies.  ``sessions`` are
-    the slots of the sessions that hold it.  ``place`` is its position among all segments of its size.
+    the slots of the sessions that hold it.  ``place`` is its position among all segments of its size,
+    ``square`` that of the map in which its middle lies.
     """
 
     name: str
@@ -54,6 +55,7 @@ class Resident:
     spare: bool = False
     sessions: set[int] = field(default_factory=set)
     place: int = -1
+    square: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(slots=True, eq=False)

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which segments are evicted next: a list of those that clients will need last, without any I/O.
 
-All residents are looked at, some in each step, and at most `MAX_LISTED` are listed.  Once as many are listed,
-only those in squares of the map that can matter are scored.  The list is not kept up to date: whether a
-segment may still be evicted is asked again when its turn comes (`shmmap.daemon.cache.evictor`), and another
-list is made while clients move and memory is short.
+Of each square of the map it is known when all in it will be needed at the latest.  The squares whose segments
+are needed last are looked at first, some in each step, until `MAX_LISTED` segments are listed and no other
+square can matter.  The list is not kept up to date: whether a segment may still be evicted is asked again
+when its turn comes (`shmmap.daemon.cache.evictor`), and another list is made while clients move and memory is
+short.
 """
 
 from __future__ import annotations
@@ -20,18 +21,23 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from shmmap.daemon.cache.ledger import Square
 from shmmap.daemon.records import Resident
-from shmmap.daemon.travel.places import NOWHERE, PAIRS_PER_BLOCK, Places, Squares, until_needed
+from shmmap.daemon.travel.places import NOWHERE, PAIRS_PER_BLOCK, Places, until_needed, widened
 
 MAX_LISTED: Final = 1024
 BLOCK: Final = 32
 """Segments looked at together; fewer where there are many places."""
 WORK_PER_STEP: Final = 8000
 """Work after which a step ends: a sixth of a millisecond."""
-LOOK_WORK: Final = 96
-"""Work of looking at a segment."""
+SQUARE_WORK: Final = 128
+"""Work of estimating when a square is needed, as of looking at it, ..."""
+LOOK_WORK: Final = 32
+"""... of looking at a segment, ..."""
 LIST_WORK: Final = 256
-"""Work of listing it."""
+"""... and of listing it."""
+DROPPED_PER_STEP: Final = 4096
+"""Squares that need not be looked at, dropped together."""
 HAND_OUT_GRACE_S: Final = 1.0
 """A segment that was just handed out is not evicted for this long, so that its reader can open it."""
 MAX_SCORE: Final = 1e12
@@ -59,9 +65,22 @@ def eviction_scores(some: Sequence[Resident], places: Places, now_s: float) -> N
     if not len(places):
         return spare - np.array([resident.last_use_s for resident in some], dtype=np.float64)
     boxes = np.array([resident.box for resident in some]).reshape(-1, 4)
-    sizes = np.array([resident.nbytes for resident in some], dtype=np.float64)
-    scores: NDArray[np.float64] = (until_needed(boxes, places, now_s) + SOON_S) * np.sqrt(sizes)
-    return np.minimum(scores, MAX_SCORE) + spare
+    return spare + _weighted(until_needed(boxes, places, now_s), [resident.nbytes for resident in some])
+
+
+def highest_scores(some: Sequence[Square], around: Places, now_s: float) -> NDArray[np.float64]:
+    """Return scores that no segment in these squares exceeds, (N,); ``around``: `widened` places."""
+    spare = SPARE_SCORE * np.array([square.may_be_spare for square in some], dtype=np.float64)
+    if not len(around):
+        return spare - np.array([square.oldest_s for square in some], dtype=np.float64)
+    middles = np.array([square.middle for square in some]).reshape(-1, 2)
+    latest_s = until_needed(np.hstack([middles, middles]), around, now_s)
+    return spare + _weighted(latest_s, [square.largest for square in some])
+
+
+def _weighted(until_s: NDArray[np.float64], sizes: Sequence[int]) -> NDArray[np.float64]:
+    scores: NDArray[np.float64] = (until_s + SOON_S) * np.sqrt(np.array(sizes, dtype=np.float64))
+    return np.minimum(scores, MAX_SCORE)
 
 
 class Candidate(NamedTuple):
@@ -107,27 +126,54 @@ class EvictionPlan:
     is_whole: bool = True
     work: int = 0
 
-    def make(self, residents: Iterator[Resident], may_go: Callable[[Resident], bool]) -> Iterator[None]:
-        """Look at all residents, some in each step, and list those that may go."""
-        block = min(BLOCK, 2 * PAIRS_PER_BLOCK // max(1, len(self.places)))
-        squares = Squares(self.places, self.now_s)
-        heap: list[Candidate] = []
-        few: list[Resident] = []  # to be scored together
-        begun = self.work
-        while some := list(islice(residents, block)):
-            before, known = squares.looked_at, len(few)
-            few += self._above(heap[0], some, squares) if len(heap) == MAX_LISTED else some
-            self.is_whole &= len(few) - known == len(some)
-            self.work += LOOK_WORK * len(some) + len(self.places) * (squares.looked_at - before)
-            if len(few) >= block:
-                self._list(few[:block], heap, may_go)
-                few = few[block:]
+    def make(self, squares: Iterator[Square], may_go: Callable[[Resident], bool]) -> Iterator[None]:
+        """Look at all squares, some in each step, and list those of their segments that may go."""
+        begun, around = self.work, widened(self.places, self.now_s)
+        block = min(BLOCK, PAIRS_PER_BLOCK // max(1, len(self.places)))
+        queue: list[tuple[float, int, Square]] = []  # a heap, the highest score first
+        while some := list(islice(squares, 2 * block)):
+            for score, square in zip(highest_scores(some, around, self.now_s), some, strict=True):
+                heapq.heappush(queue, (-score, next(_numbers), square))
+            self.work += (SQUARE_WORK + len(self.places)) * len(some)
             if self.work >= begun + WORK_PER_STEP:
                 yield
                 begun = self.work
+        heap: list[Candidate] = []
+        few: list[Resident] = []  # to be scored together
+        while queue and not (self._is_enough(heap, -queue[0][0]) and heap[0].is_unclaimed):
+            score, _, square = heapq.heappop(queue)
+            for part in self._segments_of(square, block):
+                if self._is_enough(heap, -score):
+                    self.is_whole = False
+                    part = [one for one in part if not one.sessions]
+                few += part
+                if len(few) >= block:
+                    self._list(few, heap, may_go)
+                    few = []
+                if self.work >= begun + WORK_PER_STEP:
+                    yield
+                    begun = self.work
         self._list(few, heap, may_go)
+        self.is_whole &= not queue
+        while queue:
+            del queue[-DROPPED_PER_STEP:]
+            yield
         self.listed = sorted(heap)
         self.is_whole |= bool(heap) and not self.listed[-1].is_past_grace  # others are in their grace, too
+
+    def _is_enough(self, heap: Sequence[Candidate], score: float) -> bool:
+        """Whether the list is full, of segments past their grace with higher scores."""
+        return len(heap) == MAX_LISTED and heap[0].is_past_grace and heap[0].score > score
+
+    def _segments_of(self, square: Square, block: int) -> Iterator[list[Resident]]:
+        """Yield a square's segments in parts, and learn what is known of them anew."""
+        segments = iter(list(square.segments))
+        square.forget()
+        self.work += SQUARE_WORK
+        while part := list(islice(segments, block)):
+            square.learn(part)
+            self.work += LOOK_WORK * len(part)
+            yield part
 
     def _list(
         self, some: Sequence[Resident], heap: list[Candidate], may_go: Callable[[Resident], bool]
@@ -142,20 +188,6 @@ class EvictionPlan:
                     heapq.heappop(heap)
                     self.is_whole = False
         self.work += (LIST_WORK + len(self.places)) * len(some)
-
-    def _above(self, least: Candidate, some: Sequence[Resident], squares: Squares) -> Sequence[Resident]:
-        """Leave out segments that go later than ``least``, by what is known of their squares."""
-        if not (len(self.places) and least.is_past_grace):
-            return some
-        score, is_held = least.score, not least.is_unclaimed
-        latest_s = squares.latest_s([one.box for one in some])
-        return [
-            one
-            for one, its_s in zip(some, latest_s, strict=True)
-            if (its_s + SOON_S) * math.sqrt(one.nbytes) >= score
-            or one.spare
-            or (is_held and not one.sessions)
-        ]
 
     def add(self, some: Sequence[Resident]) -> None:
         """List some more."""

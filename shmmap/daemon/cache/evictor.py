@@ -182,19 +182,14 @@ class Evictor:
         """Make a part of the next plan; once it is made, it takes the place of the present one."""
         self._stepped_s = now_s
         if self._making is None:
+            evictable = self.reclaimer.ledger.evictable
+            evictable.take_new()
             self._next = EvictionPlan(*self._positions(now_s), now_s)
-            self._making = self._next.make(self._all(), lambda one: self._may_go(one, now_s))
+            self._making = self._next.make(evictable.squares(), lambda one: self._may_go(one, now_s))
         before = self._next.work
         if next(self._making, self) is self:
             self._plan, self._making = self._next, None
         self._rests_until_s = now_s + WORK_S * (self._next.work - before)
-
-    def _all(self) -> Iterator[Resident]:
-        """Yield all segments; those that are yielded are not new any more."""
-        ledger = self.reclaimer.ledger
-        for resident in ledger.segments.walk():
-            ledger.evictable.new.pop(resident, None)
-            yield resident
 
     def _positions(self, now_s: float) -> tuple[Places, int]:
         """Return positions of clients and their version, at most `PLACES_S` old."""
@@ -215,14 +210,15 @@ class Evictor:
         plan, reclaimer = self._plan, self.reclaimer
         have_clients_moved = reclaimer.sessions.places_version != plan.places_version
         is_short = not plan.is_whole and len(plan.listed) < MAX_LISTED // 2
-        return have_clients_moved or is_short or bool(reclaimer.ledger.evictable.new)
+        evictable = reclaimer.ledger.evictable
+        return have_clients_moved or is_short or bool(evictable.new) or evictable.has_more
 
     def _list_more(self, now_s: float) -> bool:
         """List what has come into question since, or make a part of the next plan; False if none is left."""
         plan, evictable = self._plan, self.reclaimer.ledger.evictable
-        too_many = max(len(evictable.new), len(plan.listed) - MAX_LISTED) > BLOCK
+        too_many = evictable.has_more or len(plan.listed) > MAX_LISTED + BLOCK
         if self._making is None and not too_many and plan.is_whole:
-            some = [evictable.new.popitem()[0] for _ in range(len(evictable.new))]
+            some = evictable.take_new()
             plan.add([resident for resident in some if self._may_go(resident, now_s)])
             return bool(some)
         self.run_step(now_s)

@@ -14,12 +14,15 @@ import heapq
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from typing import Any, Final
+from typing import Final
 
 from shmmap.daemon.records import Key, Resident, Retired
+from shmmap.daemon.travel.places import SQUARE_M
 from shmmap.large_tables import ShardedDict
 
 _PLACES: Final = 1 << 32
+MAX_NEW: Final = 32
+"""Segments that are known to have come into question; of more, only that there are more."""
 DUE_PER_CALL: Final = 16
 IN_USE_S: Final = 0.2
 """How long, at least, a segment found in use is left alone.  The time doubles with each look if the kernel
@@ -28,6 +31,7 @@ MAX_IN_USE_S: Final = 5.0
 """... and how long at most: a precaution."""
 SHARE_S: Final = 0.0005
 """Minimum time between two looks when very many segments are mapped (a look takes 15 us)."""
+_NEVER: Final = (0.0, 0.0, 0)
 
 
 class Segments:
@@ -85,62 +89,136 @@ class Segments:
         return found, None
 
 
-class Evictable:
-    """What has changed about which residents can be evicted.
+class Square:
+    """The segments in service whose middle lies in one square of the map.
 
     Attributes
     ----------
-    new : ShardedDict
-        Segments that entered service or were released since a plan looked at them.
+    middle : (float, float)
+        Of the square, metres, map frame.
+    largest : int
+        Bytes of the largest segment, or more.
+    oldest_s : float
+        When the one unused for longest was last used, or before.
+    may_be_spare : bool
+        Whether one may have been loaded into spare memory.
+    """
+
+    __slots__ = ("largest", "may_be_spare", "middle", "oldest_s", "segments")
+
+    def __init__(self, x: float, y: float) -> None:
+        self.middle = (x + 0.5) * SQUARE_M, (y + 0.5) * SQUARE_M
+        self.segments: dict[Resident, None] = {}
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget what is known of its segments."""
+        self.largest, self.oldest_s, self.may_be_spare = 0, math.inf, False
+
+    def learn(self, some: Iterable[Resident]) -> None:
+        """Note what is known of segments that are in it."""
+        for one in some:
+            self.largest = max(self.largest, one.nbytes)
+            self.oldest_s = min(self.oldest_s, one.last_use_s)
+            self.may_be_spare |= one.spare
+
+
+class Evictable:
+    """The segments in service, and what has changed about which of them can be evicted.
+
+    Attributes
+    ----------
+    new : dict
+        Segments that entered service or were released since the last plan was begun, up to `MAX_NEW`.
+    has_more : bool
+        Whether there are more of them.
     changes : int
         How often that happened.
     """
 
     def __init__(self) -> None:
         self.changes = 0
-        self.new: ShardedDict[Resident, object] = ShardedDict()
-        self._in_use: ShardedDict[Resident, Any] = ShardedDict()  # until when it is left alone, and how long
+        self.new: dict[Resident, None] = {}
+        self.has_more = False
+        self._squares: ShardedDict[tuple[float, float], Square] = ShardedDict()
+        self._in_use: ShardedDict[Resident, tuple[float, float, int]] = ShardedDict()
         self._heap: list[tuple[float, int, Resident]] = []
-        self._number = 0
+        self._number = self._released_at = 0
+
+    def enter(self, resident: Resident) -> None:
+        """Note that a segment entered service."""
+        x0, y0, x1, y1 = resident.box
+        resident.square = key = (x0 + x1) // (2.0 * SQUARE_M), (y0 + y1) // (2.0 * SQUARE_M)
+        square = self._squares.get(key)
+        if square is None:
+            square = self._squares[key] = Square(*key)
+        square.segments[resident] = None
+        square.learn((resident,))
+        self.add(resident)
 
     def add(self, resident: Resident) -> None:
-        """Note that a segment entered service, or that a request or pin needs it no more."""
-        self.new[resident] = None
+        """Note that a segment has come into question: it is new, or something needs it no more."""
+        self._list(resident)
         self.changes += 1
+
+    def _list(self, resident: Resident) -> None:
+        if len(self.new) < MAX_NEW:
+            self.new[resident] = None
+        else:
+            self.has_more = True
 
     def leave(self, resident: Resident) -> None:
         """Forget a segment that left service."""
+        segments = self._squares[resident.square].segments
+        del segments[resident]
+        if not segments:
+            del self._squares[resident.square]
         self.new.pop(resident, None)
         self._in_use.pop(resident, None)
 
+    def take_new(self) -> list[Resident]:
+        """Return the segments that have come into question, as far as known; they are not new then."""
+        some, self.has_more = list(self.new), False
+        self.new.clear()
+        return some
+
+    def squares(self) -> Iterator[Square]:
+        """Yield the squares with segments that are there now and stay."""
+        for key in self._squares.walk():
+            square = self._squares.get(key)
+            if square is not None:
+                yield square
+
+    # --- what was found in use ----------------------------------------------------------------------
+
+    def _found(self, resident: Resident) -> tuple[float, float]:
+        """Return until when a segment is left alone that was found in use, and how long that is; else 0."""
+        until_s, for_s, number = self._in_use.get(resident, _NEVER)
+        return (until_s, for_s) if number > self._released_at else _NEVER[:2]
+
     def release(self, resident: Resident) -> bool:
         """Note that a user has released a segment; return whether it had been found in use."""
-        was_in_use = self._in_use.pop(resident, None) is not None
+        was_in_use = self._found(resident)[1] > 0.0
+        self._in_use.pop(resident, None)
         self.add(resident)
         return was_in_use
 
     def release_all(self) -> None:
         """Note that any segment that was found in use may have been released."""
-        few, many = self.new, self._in_use
-        if len(few) > len(many):
-            few, many = many, few
-        many.update(few)  # the smaller table is merged into the larger one
-        self.new, self._in_use, self._heap = many, ShardedDict(), []
+        self._released_at, self.has_more = self._number, True
         self.changes += 1
 
     def found_in_use(self, resident: Resident, now_s: float, *, is_watched: bool) -> None:
         """Leave a segment alone for a while; ``is_watched``: the kernel reports its next close."""
-        last_s = self._in_use.get(resident, (0.0, 0.0))[1]
-        for_s = min(max(IN_USE_S, 2.0 * last_s * is_watched), MAX_IN_USE_S)
+        for_s = min(max(IN_USE_S, 2.0 * self._found(resident)[1] * is_watched), MAX_IN_USE_S)
         until_s = now_s + max(for_s, SHARE_S * len(self._in_use))
-        self._in_use[resident] = until_s, for_s
         self._number += 1
+        self._in_use[resident] = until_s, for_s, self._number
         heapq.heappush(self._heap, (until_s, self._number, resident))
 
     def is_left_alone(self, resident: Resident, now_s: float) -> bool:
         """Whether a segment was found in use a moment ago."""
-        known = self._in_use.get(resident)
-        return known is not None and now_s < known[0]
+        return now_s < self._found(resident)[0]
 
     def next_look_s(self) -> float:
         """Return when the first of the segments found in use is looked at again, at the earliest."""
@@ -151,9 +229,13 @@ class Evictable:
         for _ in range(DUE_PER_CALL):
             if self.next_look_s() > now_s:
                 break
-            until_s, _, resident = heapq.heappop(self._heap)
-            if self._in_use.get(resident, (0.0, 0.0))[0] == until_s:
-                self.new[resident] = None
+            _, number, resident = heapq.heappop(self._heap)
+            if self._in_use.get(resident, _NEVER)[2] != number:
+                continue  # it left, was released, or was found in use again
+            if number > self._released_at:
+                self._list(resident)
+            else:
+                del self._in_use[resident]
 
 
 class Ledger:
@@ -173,7 +255,7 @@ class Ledger:
     segments
         All segments in memory, retired ones included.
     evictable
-        What has changed about which residents can be evicted.
+        The segments in service, and what has changed about which of them can be evicted.
     retired_bytes, freeing_bytes
         Memory of retired segments, and the part of it that the kernel is taking back now.
     unopened_bytes
@@ -297,7 +379,7 @@ class Ledger:
             self.prefetched[resident] = None
             self.prefetched_bytes += resident.nbytes
         self.segments.add(resident)
-        self.evictable.add(resident)
+        self.evictable.enter(resident)
         if old is not None:
             self._leave_service(old)
         return old

@@ -48,9 +48,7 @@ of that, so that listing what is evicted and what is fetched ahead takes a twent
 FIRST_SIDE_M: Final = 16.0
 """Side of the squares in which places are first merged, where there are too many."""
 SQUARE_M: Final = 100.0
-"""Side of the squares whose cells are judged together, see `Squares`."""
-MAX_SQUARES: Final = 8192
-"""Squares remembered: a larger dict takes long to grow."""
+"""Side of the squares whose cells are judged together, see `widened`."""
 
 
 def places_of(motion: Motion, reach_m: float) -> Places:
@@ -137,45 +135,17 @@ def until_needed(boxes: NDArray[np.float64], places: Places, now_s: float) -> ND
     return found
 
 
-class Squares:
-    """Squares of the map, each with a time within which all cells in it will be needed.
+def widened(places: Places, now_s: float) -> Places:
+    """Return places by which a square's middle is needed no sooner than any cell whose middle lies in it.
 
-    A cell belongs to the square in which its middle lies.  From the middle of the square it is at most half
-    a diagonal farther away from a place, and as it lies in another direction, each metre of that may count
-    for one and a half more.
-
-    Parameters
-    ----------
-    places, now_s
-        As for `until_needed`.
-
-    Attributes
-    ----------
-    looked_at : int
-        Number of squares for which that time was estimated.
+    A cell is at most half a diagonal farther away from a place than the middle of the square, and as it lies
+    in another direction, each metre of that may count for one and a half more.
     """
-
-    def __init__(self, places: Places, now_s: float) -> None:
-        self.looked_at = 0
-        self._now_s = now_s
-        self._latest_s: dict[tuple[float, float], float] = {}
-        half_m = SQUARE_M / math.sqrt(2.0)
-        self._places = places.copy()
-        self._places[:, 2] = np.maximum(places[:, 2], now_s) + 1.5 * half_m * places[:, 5]
-        self._places[:, 3] -= half_m
-
-    def latest_s(self, boxes: Iterable[tuple[float, float, float, float]]) -> list[float]:
-        """Return upper bounds of what `until_needed` says of these cells, seconds."""
-        known, twice_m = self._latest_s, 2.0 * SQUARE_M
-        if len(known) > MAX_SQUARES:
-            known.clear()
-        squares = [((x0 + x1) // twice_m, (y0 + y1) // twice_m) for x0, y0, x1, y1 in boxes]
-        if others := list({square for square in squares if square not in known}):
-            middles = (np.array(others) + 0.5) * SQUARE_M
-            times = until_needed(np.hstack([middles, middles]), self._places, self._now_s)
-            known.update(zip(others, times.tolist(), strict=True))
-            self.looked_at += len(others)
-        return [known[square] for square in squares]
+    half_m = SQUARE_M / math.sqrt(2.0)
+    found: Places = places.copy()
+    found[:, 2] = np.maximum(places[:, 2], now_s) + 1.5 * half_m * places[:, 5]
+    found[:, 3] -= half_m
+    return found
 
 
 def _until(

@@ -8,16 +8,24 @@ import os
 import random
 import select
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from shmmap.daemon.cache import eviction_plan, reclaimer
-from shmmap.daemon.cache.eviction_plan import BLOCK, HAND_OUT_GRACE_S, LIST_WORK, LOOK_WORK, WORK_PER_STEP
+from shmmap.daemon.cache.eviction_plan import (
+    BLOCK,
+    HAND_OUT_GRACE_S,
+    LIST_WORK,
+    LOOK_WORK,
+    MAX_LISTED,
+    SQUARE_WORK,
+    WORK_PER_STEP,
+)
 from shmmap.daemon.cache.evictor import LOOKS_PER_CALL, PLAN_S, PRESSURE_S, Evictor, Freeing
-from shmmap.daemon.cache.ledger import Ledger
+from shmmap.daemon.cache.ledger import Ledger, Square
 from shmmap.daemon.cache.reclaimer import LOOKS_PER_TURN, TICK_S, Reclaimer
 from shmmap.daemon.pins.watch import PinWatch
 from shmmap.daemon.records import Key, Resident
@@ -65,6 +73,12 @@ class Memory:
             made.append(Resident(name, key, number, nbytes, 1, box, 0.0, 1.0, prefetched=prefetched))
             self.ledger.enter(made[-1])
         return made
+
+    def move(self, resident: Resident, x: float) -> None:
+        """Have it lie elsewhere."""
+        self.ledger.evictable.leave(resident)
+        resident.box = (x, 0.0, x + 20.0, 20.0)
+        self.ledger.evictable.enter(resident)
 
     def map(self, resident: Resident) -> mmap.mmap:
         with self.directory.opened(self.reclaimer.name_on_disk(resident)) as fd:
@@ -315,7 +329,7 @@ def test_clients_decide_soon_after_they_have_moved(memory: Memory) -> None:
     """A plan is made at most each second, and none once there was memory for long."""
     some = memory.publish(30)
     for number, resident in enumerate(some):
-        resident.box = (100.0 * number, 0.0, 100.0 * number + 20.0, 20.0)
+        memory.move(resident, 100.0 * number)
     sessions, evictor = memory.reclaimer.sessions, memory.evictor
     session = sessions.open(connections.of(), "car", NOW_S)
 
@@ -346,7 +360,7 @@ def test_clients_decide_soon_after_they_have_moved(memory: Memory) -> None:
 def test_of_many_the_first_go_when_all_have_been_looked_at(memory: Memory) -> None:
     """In several calls, or steps while no load waits; what comes meanwhile goes when nothing else is left."""
     per_step = -(-WORK_PER_STEP // (BLOCK * (LOOK_WORK + LIST_WORK))) * BLOCK
-    some = memory.publish(2 * per_step + 5)
+    some = memory.publish(2 * per_step + 5)  # in one square
     random.Random(3).shuffle(some)
     for number, resident in enumerate(some):
         resident.last_use_s = number / 1e3
@@ -362,8 +376,10 @@ def test_of_many_the_first_go_when_all_have_been_looked_at(memory: Memory) -> No
     while evictor.next_s < float("inf"):
         at_s, steps = evictor.next_s, steps + 1
         evictor.run_step(at_s)
-    assert steps == 3
-    assert at_s == pytest.approx(NOW_S + PLAN_S + 2.0 * WORK_S * per_step * (LOOK_WORK + LIST_WORK))
+    assert steps == 2
+    assert at_s == pytest.approx(
+        NOW_S + PLAN_S + WORK_S * (2 * SQUARE_WORK + per_step * (LOOK_WORK + LIST_WORK))
+    )
     assert evicted(memory, 1, at_s) == [spare]
     last = memory.publish(1)[0]
     rest = len(some) - 20
@@ -423,20 +439,26 @@ def test_plans_take_a_fortieth_of_a_core_at_most(
         x, y = 20.0 * (number % 320), 20.0 * (number // 320)
         box, nbytes = (x, y, x + 20.0, y + 20.0), SMALL * (1 + number % 5)
         ledger.enter(Resident(f"{number}", Key(f"{number}", ""), number, nbytes, 1, box, 0.0, 1.0))
-    walk, until_needed = ledger.segments.walk, places.until_needed
+    squares, learn, until_needed = ledger.evictable.squares, Square.learn, places.until_needed
 
-    def counted_walk() -> Iterator[Resident]:
+    def counted_squares() -> Iterator[Square]:
         nonlocal work
-        for resident in walk():
-            work += LOOK_WORK
-            yield resident
+        for square in squares():
+            work += SQUARE_WORK
+            yield square
+
+    def counted_learn(square: Square, some: Sequence[Resident]) -> None:
+        nonlocal work
+        work += LOOK_WORK * len(some)
+        learn(square, some)
 
     def counted_until_needed(boxes: Any, where: Any, now_s: float) -> Any:
         nonlocal work
         work += len(boxes) * len(where)
         return until_needed(boxes, where, now_s)
 
-    monkeypatch.setattr(ledger.segments, "walk", counted_walk)
+    monkeypatch.setattr(ledger.evictable, "squares", counted_squares)
+    monkeypatch.setattr(Square, "learn", counted_learn)
     monkeypatch.setattr(places, "until_needed", counted_until_needed)
     monkeypatch.setattr(eviction_plan, "until_needed", counted_until_needed)
     who = [sessions.open(connections.of(), "car", NOW_S) for _ in range(clients)]
@@ -456,10 +478,10 @@ def test_plans_take_a_fortieth_of_a_core_at_most(
             steps.append(work - before)
         now_s = min(max(evictor.next_s, now_s + 1e-6), next_pose_s)
     assert max(steps) <= 3 * WORK_PER_STEP
-    assert LOOK_WORK * min(count, 20_000) <= work <= 4.0 / WORK_S + max(steps)
+    assert LOOK_WORK * 3 * MAX_LISTED <= work <= 4.0 / WORK_S + max(steps)
     found = len(sessions.places())
     assert found == clients if not vertices else 100 < found <= 128
-    for one in [*walk()]:
+    for one in [*ledger.segments.walk()]:
         ledger.segments.remove(one)  # they have no files
 
 
@@ -497,7 +519,7 @@ def test_a_wish_takes_only_what_is_needed_later(memory: Memory) -> None:
 def test_a_full_share_gives_up_what_is_needed_later_whatever_its_size(memory: Memory) -> None:
     (near,), far = memory.publish(1, LARGE, prefetched=True), memory.publish(6, prefetched=True)
     for x, resident in zip((200.0, *range(600, 1200, 100)), (near, *far), strict=True):
-        resident.box = (x, 0.0, x + 20.0, 20.0)
+        memory.move(resident, x)
     session = memory.reclaimer.sessions.open(connections.of(), "car", NOW_S)
     session.state_intent(Intent(0.0, 10.0, vx=10.0))
     memory.reclaimer.sessions.follow_moves()
