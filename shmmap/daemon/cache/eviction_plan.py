@@ -132,7 +132,8 @@ class EvictionPlan:
         block = min(BLOCK, PAIRS_PER_BLOCK // max(1, len(self.places)))
         queue: list[tuple[float, int, Square]] = []  # a heap, the highest score first
         while some := list(islice(squares, 2 * block)):
-            for score, square in zip(highest_scores(some, around, self.now_s), some, strict=True):
+            highest: list[float] = highest_scores(some, around, self.now_s).tolist()
+            for score, square in zip(highest, some, strict=True):
                 heapq.heappush(queue, (-score, next(_numbers), square))
             self.work += (SQUARE_WORK + len(self.places)) * len(some)
             if self.work >= begun + WORK_PER_STEP:
