@@ -30,7 +30,6 @@ from shmmap.daemon.loading.worker_messages import (
     Compiling,
     Done,
     Failed,
-    Fetched,
     Job,
     Need,
 )
@@ -414,9 +413,7 @@ class Scheduler:
         elif isinstance(message, Arrived):
             if self.link is not None:
                 self.link.arrived(message.bytes, now_s, message.delays_s)
-        elif isinstance(message, Fetched):
-            if self.link is not None and (load := self._jobs.get(message.number)) is not None:
-                self.link.end(load, message.bytes)
+                self.link.end(self._jobs.get(message.fetched), message.fetched_bytes)
         elif isinstance(message, Compiling):
             worker.compiling = True
         elif isinstance(message, Need):
