@@ -25,6 +25,14 @@ class Key(NamedTuple):
     layer: str
 
 
+class Absent(NamedTuple):
+    """A layer of a cell that may have to be loaded: the cell's index, and the bytes to reserve for that."""
+
+    cell: int
+    key: Key
+    nbytes: int
+
+
 @dataclass(slots=True, eq=False)
 class Resident:
     """A published segment, and the daemon's knowledge of its use.

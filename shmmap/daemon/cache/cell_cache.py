@@ -23,7 +23,7 @@ from shmmap.daemon.events.cell_events import CellEvents, PressureEvents
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.map.catalogue_view import CatalogueView, Pages
 from shmmap.daemon.pins.watch import PinWatch
-from shmmap.daemon.records import Key, Resident
+from shmmap.daemon.records import Absent, Key, Resident
 from shmmap.daemon.transport.sessions import Session, Sessions
 from shmmap.failpoints import step
 from shmmap.geometry import Area
@@ -160,6 +160,10 @@ class CellCache:
             share = 1.0 if layer == LAYER else layer_spec(layer).kind.bytes_ratio
             size = int(self.catalogue.source_bytes(index) * share) + _HEADER_ALLOWANCE_BYTES
         return -(-size // _PAGE_BYTES) * _PAGE_BYTES
+
+    def absent(self, index: int, layer: str) -> Absent:
+        """Return what a load of a layer of a cell begins with."""
+        return Absent(index, self.key(index, layer), self.estimate(index, layer))
 
     # --- finding --------------------------------------------------------------------------------
 

@@ -78,11 +78,14 @@ class Link:
     ----------
     received : dict
         Bytes received so far, by cause: ``demand``, ``ahead``, ``index``.
+    rate_bytes_s : float
+        What the link carries, bytes a second; 0 before that is known.
     """
 
     def __init__(self, arrivals: Arrivals, *, cap_bytes_s: float = 0.0, metered: bool = False) -> None:
         self._arrivals, self._cap_bytes_s, self.metered = arrivals, cap_bytes_s, metered
         self.received = {"demand": 0, "ahead": 0, "index": 0}
+        self.rate_bytes_s = 0.0
         self._objects: dict[Hashable, _Object] = {}
         self._in_order: deque[_Object] = deque()
         self._counted_bytes = self._arrived_bytes = 0
@@ -148,6 +151,7 @@ class Link:
             self._slot_s, self._slot_bytes = 0.0, 0
             while self._slots and self._slots_s - self._slots[0][0] >= REMEMBERED_S:
                 self._slots_s -= self._slots.popleft()[0]
+            self.rate_bytes_s = max((rate for _, rate in self._slots), default=0.0)
 
     def _note(self, nbytes: int, now_s: float) -> None:
         if nbytes:
@@ -167,11 +171,6 @@ class Link:
             self._in_order.popleft()
 
     # --- what may begin ---------------------------------------------------------------------------
-
-    @property
-    def rate_bytes_s(self) -> float:
-        """What the link carries, bytes a second; 0 before that is known."""
-        return max((rate for _, rate in self._slots), default=0.0)
 
     @property
     def under_way_bytes(self) -> int:

@@ -17,6 +17,7 @@ from collections.abc import Hashable
 from dataclasses import dataclass, field, replace
 from typing import Final, TypeAlias
 
+from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.loading.link import Cause, Link
 from shmmap.daemon.records import SPACE_CODES, Failure, Key, Resident
@@ -35,6 +36,10 @@ MAX_FAILURES: Final = 1 << 14
 LOAD_S: Final = 1e-4
 """Time charged to a load in addition to its bytes: many tiny cells are work, too."""
 BYTE_S: Final = 1e-9
+COMPUTED: Final = 1
+"""Bit of a load's kind: it takes a worker that computes layers, which may take long."""
+FETCHED: Final = 2
+"""Bit of a load's kind: it reads a source, over the link if there is one."""
 LOOKED_BEHIND: Final = 8
 """Loads of each kind of an asker that are examined to estimate the memory needed soon."""
 MAX_REMEMBERED: Final = 1024
@@ -88,10 +93,9 @@ class Attempt:
 class Load:
     """Work that is queued or that a worker does.
 
-    ``reserved`` bytes are promised to it while it runs, which is while there is an ``attempt``.  ``computed``
-    means that the layer is computed, which may take long.  ``link_bytes`` is what it fetches from a remote
-    origin, once that has been found out: while it waits for the link, and while it runs.  ``losses`` counts
-    loaders that were lost through no fault of this load.
+    ``kind`` is what it takes besides memory, as far as that is known when it is queued: `COMPUTED`,
+    `FETCHED`, both or neither.  ``reserved`` bytes are promised to it while it runs, which is while there is
+    an ``attempt``.  ``losses`` counts loaders that were lost through no fault of this load.
     """
 
     key: Key
@@ -100,10 +104,9 @@ class Load:
     number: int
     work: Work = Purpose.DEMAND
     asker: Hashable = None
-    computed: bool = False
+    kind: int = 0
     attempt: Attempt | None = None
     reserved: int = 0
-    link_bytes: int = 0
     losses: int = 0
 
     @property
@@ -112,14 +115,19 @@ class Load:
         return self.attempt is not None
 
     @property
-    def kind(self) -> int:
-        """What it takes besides memory: bit 0, a worker that computes layers; bit 1, the link."""
-        return self.computed | (self.link_bytes > 0) << 1
-
-    @property
     def is_ahead(self) -> bool:
         """Whether no client needs its segment now."""
         return self.work is Purpose.WISH or self.work is Purpose.SPARE
+
+
+def kind_of(cache: CellCache, index: int, layer: str) -> int:
+    """Return the kind of a load of a layer of a cell."""
+    layers = cache.layers
+    if not layers.is_computed(index, layer):
+        return FETCHED
+    if cache.warm.get(index, LAYER) is not None and not layers.halo_m((layer,)):
+        return COMPUTED  # of points in memory
+    return COMPUTED | FETCHED
 
 
 _Heap = list[tuple[float, int, Load]]
@@ -174,12 +182,6 @@ class LoadQueue:
             mine.best[load.number] = priority, kind
             heapq.heappush(mine.heaps[kind], (priority, load.number, load))
 
-    def change_kind(self, load: Load) -> None:
-        """Let a queued load, whose kind is another one now, keep its places."""
-        for asker, mine in self._askers.items():
-            if load.number in mine.best:
-                self.push(load, mine.best[load.number][0], asker)
-
     def discard(self, load: Load) -> None:
         """Remove a load from the queue."""
         self.changes += 1
@@ -206,7 +208,7 @@ class LoadQueue:
     def choose(self, *, points: bool = True, layers: bool = True, link: bool = True) -> Load | None:
         """Choose the next load among points, computed layers, or both; None if there is none.
 
-        Without ``link`` those that are known to wait for it are passed over.
+        Without ``link`` those that need it are passed over.
         """
         best: tuple[bool, float, float, int] | None = None
         found: Load | None = None
@@ -292,56 +294,46 @@ class Loads:
         priority: float,
         asker: Hashable = None,
         *,
-        computed: bool | None = None,
+        kind: int = 0,
     ) -> Load:
-        """Queue a load, or move a queued one forward; all askers of a key share one load.
-
-        Askers take turns, in `LoadQueue`.  ``computed`` means that the load may take long; by default, that
-        is every layer except ``points``.
-        """
-        load = self._queue_for(key, estimate, priority, asker, Purpose.DEMAND, computed)
+        """Queue a load, or move a queued one forward; all askers of a key share one load, and take turns."""
+        load = self._queue_for(key, estimate, priority, asker, Purpose.DEMAND, kind)
         if isinstance(load.work, LeftoverCheck):
             load.work = replace(load.work, is_asked_for=True)
         elif isinstance(load.work, Purpose):
             load.work = Purpose.DEMAND
         return load
 
-    def prefetch(self, key: Key, estimate: int, needed_in_s: float, *, computed: bool) -> Load:
+    def prefetch(self, key: Key, estimate: int, needed_in_s: float, *, kind: int = 0) -> Load:
         """Queue a load that no client has asked for yet, after all loads that clients ask for."""
-        return self._queue_for(key, estimate, PREFETCH + needed_in_s, PREFETCH, Purpose.WISH, computed)
+        return self._queue_for(key, estimate, PREFETCH + needed_in_s, PREFETCH, Purpose.WISH, kind)
 
-    def spare(self, key: Key, estimate: int, asker: Hashable, *, computed: bool) -> Load:
+    def spare(self, key: Key, estimate: int, asker: Hashable, *, kind: int = 0) -> Load:
         """Queue a load for a spare request, after all loads that clients ask for."""
-        load = self._queue_for(key, estimate, BACKGROUND, asker, Purpose.SPARE, computed)
+        load = self._queue_for(key, estimate, BACKGROUND, asker, Purpose.SPARE, kind)
         if load.work is Purpose.WISH:
             load.work = Purpose.SPARE
         return load
 
     def check_leftover(self, resident: Resident) -> None:
         """Queue the check of a previous run's segment, after all loads that clients ask for."""
-        load = self._queue_for(resident.key, 0, math.inf, None, LeftoverCheck(resident), None)
+        load = self._queue_for(resident.key, 0, math.inf, None, LeftoverCheck(resident))
         if isinstance(load.work, Purpose) and not load.is_running:
-            load.work, load.estimate = LeftoverCheck(resident, load.work is Purpose.DEMAND), 0
+            load.work = LeftoverCheck(resident, load.work is Purpose.DEMAND)
+            load.estimate = load.kind = 0
 
     def check_failed_file(self, key: Key, priority: float, asker: Hashable, stamp: Stamp) -> Load:
         """Queue the check of a file that failed, for a client that asks for its cell again."""
-        return self._queue_for(key, 0, priority, asker, FailedFileCheck(stamp), None)
+        return self._queue_for(key, 0, priority, asker, FailedFileCheck(stamp))
 
     def _queue_for(
-        self,
-        key: Key,
-        estimate: int,
-        priority: float,
-        asker: Hashable,
-        work: Work,
-        computed: bool | None,
+        self, key: Key, estimate: int, priority: float, asker: Hashable, work: Work, kind: int = 0
     ) -> Load:
         """Return the load of a key, moved forward if it is queued; if there is none, queue this ``work``."""
         load = self.by_key.get(key)
         if load is None:
             self._numbers += 1
-            computed = key.layer != LAYER if computed is None else computed
-            load = self.by_key[key] = Load(key, estimate, priority, self._numbers, work, asker, computed)
+            load = self.by_key[key] = Load(key, estimate, priority, self._numbers, work, asker, kind)
         if not load.is_running:
             load.priority = min(load.priority, priority)
             self.queue.push(load, priority, asker)
@@ -352,15 +344,18 @@ class Loads:
         load = self.by_key.get(key)
         return load is not None and not isinstance(load.work, FailedFileCheck)
 
-    def start(self, load: Load, attempt: Attempt) -> bool:
-        """Reserve the bytes of the chosen load; it runs from now on.  Return False if they do not fit."""
+    def start(self, load: Load, attempt: Attempt, link_bytes: int = 0) -> bool:
+        """Reserve the bytes of the chosen load; it runs from now on.  Return False if they do not fit.
+
+        ``link_bytes``: what it fetches over the link.
+        """
         if not self._ledger.reserve(load.estimate):
             return False
         self.queue.start(load)
         load.attempt, load.reserved = attempt, load.estimate
-        if self._link is not None and load.link_bytes:
+        if self._link is not None and link_bytes:
             cause: Cause = "ahead" if load.is_ahead else "demand"
-            self._link.begin(load, load.link_bytes, attempt.started_s, cause)
+            self._link.begin(load, link_bytes, attempt.started_s, cause)
         return True
 
     def grow(self, load: Load, nbytes: int) -> bool:
@@ -387,7 +382,6 @@ class Loads:
             load.attempt = None
             if self._link is not None:
                 self._link.end(load)
-        load.link_bytes = 0
 
     def finish(self, load: Load, failure: Failure | None = None) -> None:
         """End a load; a ``failure`` stays until a load of the key succeeds or it is cleared."""

@@ -17,7 +17,7 @@ from typing import Final
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.evictor import Freeing
 from shmmap.daemon.loading.link import Link
-from shmmap.daemon.loading.loads import Attempt, Load, Loads, Purpose
+from shmmap.daemon.loading.loads import Attempt, Load, Loads, Purpose, kind_of
 from shmmap.daemon.loading.look_ahead import URGENT_S, Prefetch, Reader
 from shmmap.daemon.loading.worker_pool import WorkerPool
 from shmmap.daemon.records import Key, Resident
@@ -172,15 +172,15 @@ class Prefetcher:
             # the last places are kept for demands, until a load ends or a client comes nearer
             self._next_s = now_s + wish.needed_in_s - URGENT_S
             return
-        key, nbytes = cache.key(wish.cell, wish.layer), cache.estimate(wish.cell, wish.layer)
+        _, key, nbytes = cache.absent(wish.cell, wish.layer)
         taken = self._ledger.prefetched_bytes + sum(self._running.values())
         self._no_room = taken + nbytes > self.budget_bytes
         if self._no_room:
             shortage = int(taken + nbytes - self.budget_bytes)
             self._next_s = now_s if self._swap(key, wish.cell, nbytes, shortage) else math.inf
         else:
-            computed = self._layers.is_computed(wish.cell, wish.layer)
-            self._loads.prefetch(key, nbytes, wish.needed_in_s, computed=computed)
+            kind = kind_of(cache, wish.cell, wish.layer)
+            self._loads.prefetch(key, nbytes, wish.needed_in_s, kind=kind)
             self._next_s = now_s
 
     def _swap(self, key: Key, index: int, nbytes: int, shortage: int) -> bool:

@@ -66,7 +66,7 @@ class _Fetch:
     frame: memoryview | ShmmapError | None = None
 
 
-Report: TypeAlias = Callable[[worker_messages.Arrived | worker_messages.Fetched], None]
+Report: TypeAlias = Callable[[worker_messages.Arrived], None]
 """Sends a message to the daemon; called in any thread."""
 
 
@@ -81,7 +81,7 @@ class _Reports:
     """Reports bytes as they come, not more often than the daemon needs them."""
 
     def __init__(self, report: Report) -> None:
-        self.send = report
+        self._report = report
         self._lock = threading.Lock()
         self._bytes, self._delays_s = 0, list[float]()
         self._sent_s = -math.inf
@@ -92,18 +92,17 @@ class _Reports:
             self._bytes += nbytes
             self._delays_s += [delay_s] if delay_s is not None else []
             if time.monotonic() >= self._sent_s + REPORTED_S:
-                self._flush()
+                self._send()
 
-    def flush(self) -> None:
-        """Report what was not reported yet."""
+    def fetched(self, number: int, nbytes: int) -> None:
+        """Report that a job needs the origin no more, for which this many bytes have come."""
         with self._lock:
-            self._flush()
+            self._send(number, nbytes)
 
-    def _flush(self) -> None:
-        if self._bytes:
-            self._sent_s = time.monotonic()
-            self.send(worker_messages.Arrived(self._bytes, tuple(self._delays_s)))
-            self._bytes, self._delays_s = 0, []
+    def _send(self, fetched: int = 0, fetched_bytes: int = 0) -> None:
+        self._sent_s = time.monotonic()
+        self._report(worker_messages.Arrived(self._bytes, tuple(self._delays_s), fetched, fetched_bytes))
+        self._bytes, self._delays_s = 0, []
 
 
 def _get(objects: KeptObjects, name: ObjectName) -> memoryview:
@@ -239,8 +238,7 @@ class ObjectFetcher:
     def _finish_if_complete(self, number: int) -> None:
         fetches = [self._fetches[digest] for digest in self._needs[number]]
         if all(fetch.frame is not None for fetch in fetches):
-            self._reports.flush()
-            self._reports.send(worker_messages.Fetched(number, sum(fetch.received for fetch in fetches)))
+            self._reports.fetched(number, sum(fetch.received for fetch in fetches))
             for fetch in fetches:
                 fetch.received = 0
             self._done.append(number)

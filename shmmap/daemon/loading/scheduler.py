@@ -18,7 +18,17 @@ from typing import Final
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.loading.link import Link
-from shmmap.daemon.loading.loads import Attempt, FailedFileCheck, LeftoverCheck, Load, Loads, Purpose
+from shmmap.daemon.loading.loads import (
+    COMPUTED,
+    FETCHED,
+    Attempt,
+    FailedFileCheck,
+    LeftoverCheck,
+    Load,
+    Loads,
+    Purpose,
+    kind_of,
+)
 from shmmap.daemon.loading.lost_workers import LostWorkers
 from shmmap.daemon.loading.prefetcher import Prefetcher
 from shmmap.daemon.loading.room import Room
@@ -30,13 +40,12 @@ from shmmap.daemon.loading.worker_messages import (
     Compiling,
     Done,
     Failed,
-    Fetched,
     Job,
     Need,
 )
 from shmmap.daemon.loading.worker_pool import NOT_OPENED, Opened, Worker, WorkerPool
 from shmmap.daemon.map.catalogue_view import CatalogueView
-from shmmap.daemon.records import SPACE_CODES, Failure, Key, Resident, failure_code
+from shmmap.daemon.records import SPACE_CODES, Absent, Failure, Key, Resident, failure_code
 from shmmap.errors import Replaced
 from shmmap.failpoints import step
 from shmmap.installed import RESTART, is_replaced
@@ -188,41 +197,35 @@ class Scheduler:
 
     # --- requests -------------------------------------------------------------------------------
 
-    def want(
-        self, index: int, layer: str, priority: float, now_s: float, asker: Hashable = None
-    ) -> Load | None:
+    def want(self, absent: Absent, priority: float, now_s: float, asker: Hashable = None) -> Load | None:
         """Make sure that an absent cell is being loaded; return None if its load failed too recently.
 
         A cell that failed too recently is loaded only if its file has changed since.  A worker checks that,
         if the state of the file that failed is known.
         """
-        cache = self._cache
-        key = cache.key(index, layer)
-        failure = self.loads.failures.get(key)
+        key, failure = absent.key, self.loads.failures.get(absent.key)
         if failure is not None and key not in self.loads.by_key and now_s >= failure.retry_at_s:
             self._events.emit(self._events.retried, key, failure)
             failure = None
         if failure is None or key in self.loads.by_key:
-            computed = self._layers.is_computed(index, layer)
-            return self.loads.want(key, cache.estimate(index, layer), priority, asker, computed=computed)
+            kind = kind_of(self._cache, absent.cell, key.layer)
+            return self.loads.want(key, absent.nbytes, priority, asker, kind=kind)
         if failure.code in SPACE_CODES or failure.stamp is None:
             return None
         return self.loads.check_failed_file(key, priority, asker, failure.stamp)
 
-    def want_spare(self, index: int, layer: str, now_s: float, asker: Hashable) -> Load | None:
+    def want_spare(self, absent: Absent, now_s: float, asker: Hashable) -> Load | None:
         """Load an absent cell for a spare request if that costs no client anything now; else return None.
 
         A load that another request or a forecast has begun is returned, too.
         """
-        cache, pool = self._cache, self.pool
-        key = cache.key(index, layer)
-        load = self.loads.by_key.get(key)
+        key = absent.key
+        load, failure = self.loads.by_key.get(key), self.loads.failures.get(key)
         if load is not None and (load.is_running or load.work is not Purpose.WISH):
             return load
-        estimate, failure = cache.estimate(index, layer), self.loads.failures.get(key)
-        if len(self.loads) or pool.free_places <= self.prefetcher.kept_places:
+        if len(self.loads) or self.pool.free_places <= self.prefetcher.kept_places:
             return None
-        if self._ledger.shortage(estimate) > 0:
+        if self._ledger.shortage(absent.nbytes) > 0:
             return None
         if any(one.work is Purpose.SPARE for one in self._jobs.values()):
             return None
@@ -230,8 +233,8 @@ class Scheduler:
             return None
         if failure is not None and now_s < failure.retry_at_s:
             return None
-        computed = self._layers.is_computed(index, layer)
-        return self.loads.spare(key, estimate, asker, computed=computed)
+        kind = kind_of(self._cache, absent.cell, key.layer)
+        return self.loads.spare(key, absent.nbytes, asker, kind=kind)
 
     def map_changed(self) -> None:
         """Handle another state of the map: loads of cells that left it are ended, some in each `pump`."""
@@ -315,8 +318,8 @@ class Scheduler:
         if not (points or layers):
             return False
         load = self.loads.queue.choose(points=points, layers=layers)
-        if load is not None and load.link_bytes and not self._may_fetch(load, now_s):
-            # what needs none goes on
+        if load is not None and load.kind & FETCHED and not self._may_fetch(load, now_s):
+            # what needs no link goes on
             load = self.loads.queue.choose(points=points, layers=layers, link=False)
         if load is None:
             return False
@@ -329,7 +332,7 @@ class Scheduler:
             if self._ledger.resident_named(resident.name) is not resident:  # it was retired
                 self._load_after_all(load)
                 return True
-        if load.computed and self._waits_for_pages(load, index, now_s):
+        if load.kind & COMPUTED and self._waits_for_pages(load, index, now_s):
             return True
         shortage = self._ledger.shortage(load.estimate) if load.estimate else 0
         if shortage > 0:
@@ -342,19 +345,16 @@ class Scheduler:
         return self._start(load, index, now_s)
 
     def _start(self, load: Load, index: int, now_s: float) -> bool:
-        """Give a load for which there is memory to a worker, if the link has room; as `_hand_out_next`."""
+        """Give a load for which there is room to a worker; as `_hand_out_next`."""
         layers, layer, attempt = self._layers, load.key.layer, Attempt(now_s)
         if isinstance(load.work, Purpose):
             sources = map(self._cache.catalogue.stamp, (index, *layers.neighbours(index, layer)))
             attempt.sources, attempt.version = tuple(sources), layers.version(index, layer)
         job = self._job(load, index, self._job_numbers + 1)
-        load.link_bytes = 0
+        link_bytes = 0
         if self._needed_bytes is not None and isinstance(job, Job):
-            load.link_bytes = self._needed_bytes(job)
-        if not self._may_fetch(load, now_s):
-            self.loads.queue.change_kind(load)
-            return True
-        self.loads.start(load, attempt)
+            link_bytes = self._needed_bytes(job)
+        self.loads.start(load, attempt, link_bytes)
         self._job_numbers += 1
         is_wish = load.work is Purpose.WISH
         try:
@@ -376,8 +376,8 @@ class Scheduler:
         return True
 
     def _may_fetch(self, load: Load, now_s: float) -> bool:
-        """Whether the link has room for a load; what is made from memory, and checks, need none."""
-        if self.link is None or not load.link_bytes or self.link.may_begin(now_s, ahead=load.is_ahead):
+        """Whether the link, if there is one, has room for a load that needs it."""
+        if self.link is None or self.link.may_begin(now_s, ahead=load.is_ahead):
             return True
         # a wish waits for what is under way: whatever comes of that wakes the loop
         self._link_s = self.link.rests_until_s if load.is_ahead else self.link.next_s()
@@ -414,9 +414,7 @@ class Scheduler:
         elif isinstance(message, Arrived):
             if self.link is not None:
                 self.link.arrived(message.bytes, now_s, message.delays_s)
-        elif isinstance(message, Fetched):
-            if self.link is not None and (load := self._jobs.get(message.number)) is not None:
-                self.link.end(load, message.bytes)
+                self.link.end(self._jobs.get(message.fetched), message.fetched_bytes)
         elif isinstance(message, Compiling):
             worker.compiling = True
         elif isinstance(message, Need):
@@ -541,6 +539,7 @@ class Scheduler:
         is_asked_for = not isinstance(load.work, LeftoverCheck) or load.work.is_asked_for
         if is_asked_for and index is not None:
             load.work, load.estimate = Purpose.DEMAND, self._cache.estimate(index, load.key.layer)
+            load.kind = kind_of(self._cache, index, load.key.layer)
             self.loads.requeue(load)
         else:
             self._end(load)

@@ -343,7 +343,7 @@ def work(channel: socket.socket, settings: WorkerSettings) -> int:
 
         served = ServedFrom.from_words(*settings.origin)
 
-        def report(message: worker_messages.Arrived | worker_messages.Fetched) -> None:
+        def report(message: worker_messages.Arrived) -> None:
             with contextlib.suppress(OSError):  # the daemon has ended, or wants this process no more
                 channel.send(worker_messages.encode(message))
 

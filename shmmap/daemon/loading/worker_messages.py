@@ -92,17 +92,15 @@ class Begun(msgspec.Struct, array_like=True, tag="begun"):
 
 
 class Arrived(msgspec.Struct, array_like=True, tag="arrived"):
-    """Report bytes that have come from the origin since the last report, and after how long answers began."""
+    """Report bytes that have come from the origin since the last report, and after how long answers began.
+
+    ``fetched`` is the number of a job that needs the origin no more, for which ``fetched_bytes`` have come.
+    """
 
     bytes: int
     delays_s: tuple[float, ...] = ()
-
-
-class Fetched(msgspec.Struct, array_like=True, tag="fetched"):
-    """Report that a job needs the origin no more; ``bytes`` have come from there for it."""
-
-    number: int
-    bytes: int
+    fetched: int = 0
+    fetched_bytes: int = 0
 
 
 class Compiling(msgspec.Struct, array_like=True, tag="compiling"):
@@ -188,7 +186,7 @@ class Ended(msgspec.Struct, array_like=True, tag="ended"):
 
 ToWorker: TypeAlias = Job | Check | Prepare | Root | Decision
 FromWorker: TypeAlias = (
-    Ready | Begun | Arrived | Fetched | Compiling | Need | Done | Prepared | Checked | Failed | Ended
+    Ready | Begun | Arrived | Compiling | Need | Done | Prepared | Checked | Failed | Ended
 )
 
 encode: Final = msgspec.msgpack.Encoder().encode

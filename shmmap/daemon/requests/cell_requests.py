@@ -24,7 +24,7 @@ from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.loading.loads import Load
 from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.map.catalogue_view import PageNews
-from shmmap.daemon.records import SPACE_CODES, Key, Resident
+from shmmap.daemon.records import SPACE_CODES, Absent, Key, Resident
 from shmmap.daemon.requests import limits
 from shmmap.daemon.requests.differential import difference, holds_few, warm_difference
 from shmmap.daemon.requests.waiting_list import CellRequest, Message, WaitingList
@@ -91,13 +91,17 @@ class _Found:
 
 @dataclass(eq=False, slots=True)
 class _Answer:
-    """Cells of a reply; ``stale`` ones are outdated, ``outstanding`` are the loads that may bring more."""
+    """Cells of a reply; ``stale`` ones are outdated, ``outstanding`` are the loads that may bring more.
+
+    ``looked_up`` are all requested cells, absent ones too.
+    """
 
     residents: list[Resident] = field(default_factory=list)
     stale: set[Resident] = field(default_factory=set)
     pending: list[PendingCell] = field(default_factory=list)
     failed: list[FailedCell] = field(default_factory=list)
     outstanding: set[Key] = field(default_factory=set)
+    looked_up: Sequence[Resident | Absent] = ()
 
 
 class CellRequests:
@@ -296,7 +300,7 @@ class CellRequests:
         answer = self._look_up(request, found, now_s)
         if self._may_wait(request, found, answer, now_s):
             request.attempts += 1
-            needed = set() if request.is_spare else {self._cache.key(*cell) for cell in found.cells}
+            needed = set() if request.is_spare else {one.key for one in answer.looked_up}
             self._waiting.wait(request, needed, answer.outstanding, found.pages)
             return True
         if any(cell.holders is _UNNAMED for cell in answer.failed):
@@ -324,52 +328,48 @@ class CellRequests:
         """Find the segments of cells, and request loads of cold ones; cut the cells if these are many."""
         cache, layers = self._cache, self._cache.warm.layers
         warm = {layer: layers[layer].get for layer in request.layers if layer in layers}
-        cells, cold = found.cells, list[tuple[int, str]]()
-        residents: list[Resident | None] = []
+        cells, cold = found.cells, 0
+        looked_up: list[Resident | Absent] = []
         for place, (index, layer) in enumerate(cells):
             resident = warm[layer](index) if layer in warm else None
             resident = resident or cache.find_warm(index, layer, now_s)
             if resident is None:
-                if len(cold) == MAX_COLD:
+                if cold == MAX_COLD:
                     self._cut(found, place)
                     break
-                cold.append((index, layer))
-            residents.append(resident)
-        del residents[len(cells) :]
-        del cold[residents.count(None) :]
-        if cold:
-            keys = (cache.key(*cell) for cell in cold)
-            limits.check_queue(self._scheduler.loads, request.session.asker, keys)
+                cold += 1
+            looked_up.append(resident or cache.absent(index, layer))
+        del looked_up[len(cells) :]
+        absent = [one.key for one in looked_up if isinstance(one, Absent)]
+        if absent:
+            limits.check_queue(self._scheduler.loads, request.session.asker, absent)
         if not request.attempts:
-            self._check_quota(request, cells, residents, now_s)
+            self._check_quota(request, cells, looked_up, now_s)
             if not request.is_spare:
-                self._statistics.add("hits", len(cells) - len(cold))
-                self._statistics.add("misses", len(cold))
-        answer = _Answer()
+                self._statistics.add("hits", len(cells) - len(absent))
+                self._statistics.add("misses", len(absent))
+        answer = _Answer(looked_up=looked_up)
         answer.failed = [
             FailedCell(cell_id, layer, "unknown_cell", "the map has no such cell")
             for cell_id, layer in found.unknown
         ]
-        distances = self._distances_m(request, cells) if cold else [0.0] * len(cells)
-        for cell, resident, distance in zip(cells, residents, distances, strict=True):
-            if resident is not None and not request.refused:
-                answer.residents.append(resident)
+        distances = self._distances_m(request, cells) if absent else [0.0] * len(cells)
+        for (index, _layer), one, distance in zip(cells, looked_up, distances, strict=True):
+            if isinstance(one, Resident) and not request.refused:
+                answer.residents.append(one)
             else:
-                self._look_up_cold(request, found, answer, cell, resident, distance, now_s)
+                self._look_up_cold(request, found, answer, index, one, distance, now_s)
         return answer
 
     def _check_quota(
         self,
         request: CellRequest,
         cells: Sequence[tuple[int, str]],
-        residents: Sequence[Resident | None],
+        looked_up: Sequence[Resident | Absent],
         now_s: float,
     ) -> None:
         """Refuse the cells that exceed the session's quota; what is refused stays so until the answer."""
-        sizes = [
-            self._cache.estimate(*cell) if resident is None else resident.nbytes
-            for cell, resident in zip(cells, residents, strict=True)
-        ]
+        sizes = [one.nbytes for one in looked_up]
         refused = self._quota.refused(
             request.session, cells, sizes, lambda some: self._distances_m(request, some)
         )
@@ -390,22 +390,25 @@ class CellRequests:
         request: CellRequest,
         found: _Found,
         answer: _Answer,
-        cell: tuple[int, str],
-        resident: Resident | None,
+        index: int,
+        one: Resident | Absent,
         distance: float,
         now_s: float,
     ) -> None:
         """Add a cell that is not warm, or may be refused, to the answer: as resident, pending or failed."""
         cache, loads = self._cache, self._scheduler.loads
-        key, layer = cache.key(*cell), cell[1]
+        key, layer = one.key, one.key.layer
         wire_id = cache.wire_id(key.cell_id)
         if key in request.refused:
             session = request.session
             mine = session.as_holder(session.held_bytes, len(session.held))
-            holders, box = (mine,) if mine.bytes else (), cache.catalogue.box(cell[0])
+            holders, box = (mine,) if mine.bytes else (), cache.catalogue.box(index)
             answer.failed.append(FailedCell(wire_id, layer, "over_budget", self._quota.message, holders, box))
             return
-        resident = resident or cache.resident(key)
+        if isinstance(one, Resident):
+            answer.residents.append(one)
+            return
+        resident = cache.resident(key)
         if resident is not None and cache.is_current(resident):
             answer.residents.append(resident)
             return
@@ -413,29 +416,27 @@ class CellRequests:
         if resident is not None and not is_held:
             answer.residents.append(resident)
             answer.stale.add(resident)
-        if self._want(request, cell, key, distance, now_s):
+        if self._want(request, one, distance, now_s):
             answer.outstanding.add(key)
         failure = loads.failures.get(key)
         if failure is not None and not loads.is_promised(key):
             holders = _UNNAMED if failure.code in SPACE_CODES else ()
-            box = cache.catalogue.box(cell[0])
+            box = cache.catalogue.box(index)
             answer.failed.append(FailedCell(wire_id, layer, failure.code, failure.message, holders, box))
         else:
             answer.pending.append(PendingCell(wire_id, layer))
 
-    def _want(
-        self, request: CellRequest, cell: tuple[int, str], key: Key, distance: float, now_s: float
-    ) -> Load | None:
+    def _want(self, request: CellRequest, absent: Absent, distance: float, now_s: float) -> Load | None:
         """Request the load of a cold cell, unless it failed while the request waited for it."""
-        loads, asker = self._scheduler.loads, request.session.asker
+        loads, key, asker = self._scheduler.loads, absent.key, request.session.asker
         if request.is_spare:
             may_begin = not request.attempts
-            return self._scheduler.want_spare(*cell, now_s, asker) if may_begin else None
+            return self._scheduler.want_spare(absent, now_s, asker) if may_begin else None
         if request.attempts and key in loads.failures and key not in loads.by_key:
             return None
         if not request.attempts:
             self._scheduler.prefetcher.note_cold(request.session, key)
-        return self._scheduler.want(*cell, distance, now_s, asker)
+        return self._scheduler.want(absent, distance, now_s, asker)
 
     def _reply(self, session: Session, message: Message, found: _Found, answer: _Answer) -> None:
         """Send a reply; `_hand_out` does the bookkeeping afterwards."""

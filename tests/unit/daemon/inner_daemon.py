@@ -77,8 +77,7 @@ def finish(work: Iterator[None] | None) -> None:
 class InnerDaemon:
     """What the daemon has in memory, and requests over one map; ``offset_s`` moves its clock ahead.
 
-    With a ``link``, each job that reads a cell uses it, although the cells are files; those in ``on_disk`` do
-    not.
+    With a ``link``, each job that reads a cell uses it, although the cells are files; ``jobs`` are all.
     """
 
     def __init__(
@@ -112,7 +111,7 @@ class InnerDaemon:
         self.offset_s = 0.0
         self.stopped_at_s: float | None = None
         pins = PinWatch(self.directory, events=True)
-        self.on_disk: set[str] = set()
+        self.jobs: list[Job] = []
         fetched = FetchedFrom((), 1, link, self._needed_bytes) if link else FROM_FILES
         self.memory = memory = MapInMemory(
             config, self.origin.load(), self.directory, pins, "", 0o400, -1, None, fetched, clock=self.now_s
@@ -153,7 +152,8 @@ class InnerDaemon:
         self.due.append(answer)
 
     def _needed_bytes(self, job: Job) -> int:
-        return 0 if job.points or Path(job.cell_id).name in self.on_disk else FETCHED_BYTES
+        self.jobs.append(job)
+        return 0 if job.points else FETCHED_BYTES
 
     def ask(self, session: Session, message: Area | Differential | Selected) -> None:
         """Begin to serve a request for cells, and do what of it needs no waiting."""

@@ -127,7 +127,7 @@ class OperatorPins:
         self._keys[key] = self._size(key)
         index = self.cache.index_of(key.cell_id)
         if index is not None and self.cache.find_warm(index, key.layer, now_s) is None:
-            self.scheduler.want(index, key.layer, BACKGROUND, now_s)
+            self.scheduler.want(self.cache.absent(index, key.layer), BACKGROUND, now_s)
 
     def _size(self, key: Key) -> int:
         ledger = self.cache.ledger

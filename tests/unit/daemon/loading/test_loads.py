@@ -13,6 +13,8 @@ from hypothesis import strategies as st
 from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.loading.loads import (
     BACKGROUND,
+    COMPUTED,
+    FETCHED,
     Attempt,
     FailedFileCheck,
     LeftoverCheck,
@@ -133,7 +135,7 @@ def test_what_goes_back_costs_nothing() -> None:
 def test_points_pass_layers_that_no_loader_can_take() -> None:
     queue = LoadQueue()
     layer, points = load(), load()
-    layer.computed = True
+    layer.kind = COMPUTED
     queue.push(layer, 0.0, "a")
     queue.push(points, 9.0, "a")
     assert queue.choose(layers=False) is points
@@ -146,13 +148,11 @@ def test_what_needs_no_link_passes_what_waits_for_it() -> None:
     """Which keeps its place, of each asker."""
     queue = LoadQueue()
     first, fetched, free = load(), load(), load()
+    first.kind = fetched.kind = FETCHED
     queue.push(first, 0.0, "a")
     queue.push(fetched, 1.0, "a")
     queue.push(fetched, 2.0, "b")
     queue.push(free, 3.0, "a")
-    for one in (fetched, first):
-        one.link_bytes = 4096
-        queue.change_kind(one)
     assert queue.choose(link=False) is free
     queue.discard(free)
     assert queue.choose(link=False) is None
@@ -173,7 +173,7 @@ def test_what_no_request_waits_for_comes_last() -> None:
 @given(
     st.lists(
         st.tuples(
-            st.sampled_from(["push", "again", "link", "start", "discard"]),
+            st.sampled_from(["push", "again", "start", "discard"]),
             st.integers(0, 3),
             st.integers(0, 99),
         )
@@ -186,14 +186,12 @@ def test_everything_comes_once_and_nearest_first_of_each(steps: list[tuple[str, 
         chosen = list(waiting)[number % len(waiting)] if waiting else None
         if what == "push" or chosen is None:
             one = load()
+            one.kind = number % 4
             queue.push(one, number, asker)
             waiting[one] = {asker: number}
         elif what == "again":
             queue.push(chosen, number, asker)
             waiting[chosen][asker] = min(number, waiting[chosen].get(asker, number))
-        elif what == "link":
-            chosen.link_bytes = 0 if chosen.link_bytes else 4096
-            queue.change_kind(chosen)
         elif what == "discard":
             queue.discard(chosen)
             del waiting[chosen]
@@ -224,16 +222,16 @@ def loads() -> Loads:
 
 @pytest.mark.parametrize("runs", [False, True])
 def test_a_demand_takes_over_what_was_loaded_ahead(loads: Loads, runs: bool) -> None:
-    wish = loads.prefetch(KEY, 100, 5.0, computed=False)
+    wish = loads.prefetch(KEY, 100, 5.0)
     assert (wish.work, wish.is_ahead) == (Purpose.WISH, True)
     if not runs:
-        assert loads.spare(KEY, 100, "a", computed=False) is wish
+        assert loads.spare(KEY, 100, "a") is wish
         assert (wish.work, wish.is_ahead) == (Purpose.SPARE, True)
     elif loads.queue.choose() is wish:
         assert loads.start(wish, Attempt(0.0))
     assert loads.want(KEY, 100, 3.0, "b") is wish
     assert (wish.work, wish.is_ahead, wish.is_running) == (Purpose.DEMAND, False, runs)
-    assert loads.prefetch(KEY, 100, 5.0, computed=False) is wish
+    assert loads.prefetch(KEY, 100, 5.0) is wish
     assert wish.work is Purpose.DEMAND
 
 
@@ -257,7 +255,7 @@ def test_a_leftover_that_is_found_late_is_checked_instead_of_loaded(
     loads: Loads, runs: bool, is_wish: bool
 ) -> None:
     """A page of the map had to come first; a load that runs already supersedes it."""
-    load = loads.prefetch(KEY, 100, 5.0, computed=False) if is_wish else loads.want(KEY, 100, 3.0, "a")
+    load = loads.prefetch(KEY, 100, 5.0) if is_wish else loads.want(KEY, 100, 3.0, "a")
     before = load.work
     if runs and loads.queue.choose() is load:
         assert loads.start(load, Attempt(0.0))

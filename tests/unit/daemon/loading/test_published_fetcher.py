@@ -115,9 +115,12 @@ def test_bytes_that_come_at_the_same_time_are_all_reported(monkeypatch: pytest.M
         monkeypatch.setattr(published_reader, "REPORTED_S", 0.0)
         return reports
 
-    for first in (one_byte, _Reports.flush):
+    def fetched(reports: _Reports) -> None:
+        reports.fetched(1, 3)
+
+    for first in (one_byte, fetched):
         for reports in interleaved(after_one, first, one_byte):
-            reports.flush()
+            fetched(reports)
             assert sum(message.bytes for message in sent) == 3 + (first is one_byte)
             sent.clear()
 
@@ -139,7 +142,7 @@ class Loader:
         self._monkeypatch.setattr(published_reader, "SLOW_S", 1e9)
         fetcher = ObjectFetcher(cast("Any", Objects()))
         fetcher._threads = cast("Any", self)
-        fetcher._reports = cast("Any", SimpleNamespace(flush=int, send=str))
+        fetcher._reports = cast("Any", SimpleNamespace(fetched=pow))
         for number in range(1, 5):
             begin(fetcher, number, b"%d" % number, self._monkeypatch, MAX_BYTES // 2)
         self._submitted.popleft()()

@@ -6,12 +6,11 @@ from __future__ import annotations
 import os
 import signal
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from shmmap.daemon.loading.link import STALLED_S, Link
-from shmmap.daemon.loading.loads import Load
+from shmmap.daemon.loading.loads import FETCHED, Purpose
 from shmmap.daemon.map.arrivals import Arrivals
 from shmmap.layers.points import LAYER
 from shmmap.protocol.messages import Selected
@@ -50,41 +49,57 @@ def test_a_demand_begins_when_the_link_is_silent_or_has_room(waiting: InnerDaemo
     assert link.under_way_bytes == 0
 
 
-def test_what_is_on_the_disk_passes_what_waits_for_the_link(waiting: InnerDaemon) -> None:
+def test_what_is_made_from_memory_passes_what_waits_for_the_link(inner: Inner, small_map: DividedMap) -> None:
     """Whatever number of cells waits, which are nearest first when the link has room."""
-    one, link = waiting, waiting.scheduler.link
-    assert link is not None
-    near, *others = "0_0.pcd", "0_20.pcd", "20_0.pcd", "20_20.pcd"
-    one.on_disk = {others[-1]}
-    one.ask(one.session(), Selected(1, (near, *others), wait=600.0))
-    one.ask(one.session(), Selected(2, (others[-1],), wait=600.0))
-    assert names(one.cells_of(2)) == [others[-1]]
+    link = Link(Arrivals())
+    one = inner(small_map.root, link=link)
+    *waiting, here = "0_0.pcd", "0_20.pcd", "20_0.pcd", "20_20.pcd"
+    one.cells_for(Selected(1, (here,), wait=30.0))
+    one.stop_clock()
+    link.begin(OTHER, WIDE, one.now_s(), "demand")
+    one.ask(one.session(), Selected(2, tuple(waiting), wait=600.0))
+    made = Selected(3, (here,), ("voxel(leaf=1.0)",), wait=600.0)
+    assert names(one.cells_for(made)) == [here]
     assert not any(load.is_running for load in one.loads.by_key.values())
+    assert link.under_way_bytes == WIDE
     assert 0.0 < sleeps_s(one) <= STALLED_S
-    started: list[str] = []
-    begin = link.begin
-
-    def begun(load: Load, *more: Any) -> None:
-        started.append(load.key.cell_id)
-        begin(load, *more)
-
-    link.begin = begun  # type: ignore[method-assign, assignment]
+    one.jobs.clear()
     link.end(OTHER)
-    assert names(one.cells_of(1)) == [near, *others]
-    assert [Path(cell).name for cell in started] == [near, *others[:-1]]
+    assert names(one.cells_of(2)) == waiting
+    assert [Path(job.cell_id).name for job in one.jobs] == waiting
 
 
-def test_what_a_lost_loader_was_to_fetch_may_have_come_to_the_disk(waiting: InnerDaemon) -> None:
+def test_a_job_is_made_once_when_the_link_has_room_for_it(waiting: InnerDaemon) -> None:
     one, link = waiting, waiting.scheduler.link
     assert link is not None
-    one.ask(one.session(), Selected(1, (CELL,), wait=600.0))
-    one.turn()
+    one.ask(one.session(), Selected(1, (CELL, "0_20.pcd"), wait=30.0))
+    for _ in range(3):
+        one.turn()
+    assert not one.jobs
+    link.end(OTHER)
+    assert names(one.cells_of(1)) == [CELL, "0_20.pcd"]
+    assert len(one.jobs) == 2
+
+
+def test_a_cell_whose_file_was_mended_waits_for_the_link(inner: Inner, small_map: DividedMap) -> None:
+    """The check of its file does not."""
+    link = Link(Arrivals())
+    one = inner(small_map.root, link=link)
+    one.stop_clock()
+    path = small_map.pcd_dir / CELL
+    good = path.read_bytes()
+    path.write_bytes(b"broken")
+    assert [cell.code for cell in one.cells_for(Selected(1, (CELL,), wait=600.0)).failed] == ["load_failed"]
+    path.write_bytes(good)
+    link.begin(OTHER, WIDE, one.now_s(), "demand")
+    one.ask(one.session(), Selected(2, (CELL,), wait=600.0))
     (load,) = one.loads.by_key.values()
-    assert load.link_bytes == FETCHED_BYTES
-    one.on_disk = {CELL}
-    one.loads.requeue(load)
-    assert names(one.cells_of(1)) == [CELL]
-    assert link.under_way_bytes == WIDE
+    one.run_until(lambda: load.work is Purpose.DEMAND)
+    one.turn()
+    assert one.loads.by_key[load.key] is load
+    assert not load.is_running
+    link.end(OTHER)
+    assert names(one.cells_of(2)) == [CELL]
 
 
 def test_nothing_is_waited_for_once_the_load_has_gone(waiting: InnerDaemon) -> None:
@@ -101,7 +116,7 @@ def test_nothing_is_waited_for_once_the_load_has_gone(waiting: InnerDaemon) -> N
 def test_a_wish_waits_for_what_is_under_way(waiting: InnerDaemon) -> None:
     one, link = waiting, waiting.scheduler.link
     assert link is not None
-    load = one.loads.prefetch(one.cache.key(0, LAYER), 4096, 5.0, computed=False)
+    load = one.loads.prefetch(one.cache.key(0, LAYER), 4096, 5.0, kind=FETCHED)
     one.offset_s += 2 * STALLED_S
     one.turn()
     assert not load.is_running
@@ -118,17 +133,6 @@ def test_a_metered_link_fetches_nothing_for_a_spare_request(inner: Inner, small_
     assert not one.loads.by_key
     assert sleeps_s(one) > STALLED_S
     assert names(one.cells_for(Selected(2, (CELL,), wait=30.0))) == [CELL]
-
-
-def test_what_is_made_from_memory_waits_for_no_link(inner: Inner, small_map: DividedMap) -> None:
-    link = Link(Arrivals())
-    one = inner(small_map.root, link=link)
-    session = one.session()
-    one.cells_for(Selected(1, (CELL,), wait=30.0), session)
-    one.stop_clock()
-    link.begin(OTHER, WIDE, one.now_s(), "demand")
-    assert names(one.cells_for(Selected(2, (CELL,), ("voxel(leaf=1.0)",), wait=30.0), session)) == [CELL]
-    assert link.under_way_bytes == WIDE
 
 
 def test_a_loader_that_is_killed_leaves_nothing_under_way(inner: Inner, small_map: DividedMap) -> None:
