@@ -91,7 +91,8 @@ __all__ = [
     "warn_program",
 ]
 
-_OURS: Final = ("shmmap.", "shmmap_clients.")
+_NO_PROGRAM: Final = ("shmmap.", "shmmap_clients.", "asyncio.")
+"""How names of modules begin that only stand between a program and a warning."""
 
 
 class ShmmapError(Exception):
@@ -123,7 +124,7 @@ class ShmmapWarning(UserWarning):
 def warn_program(text: str) -> None:
     """Issue a `ShmmapWarning` at the line of the program that called the library."""
     level, frame = 2, sys._getframe(1)
-    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith(_OURS):
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith(_NO_PROGRAM):
         level, frame = level + 1, frame.f_back
     warnings.warn(text, ShmmapWarning, stacklevel=level)
 

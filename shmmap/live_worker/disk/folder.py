@@ -40,7 +40,7 @@ def named(name: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise OSError(error.errno, f"{name} cannot be read: {error.strerror}") from error
+        raise OSError(error.errno, f"{name}: {error.strerror}") from error
 
 
 _KINDS: Final = {
@@ -103,13 +103,15 @@ class FolderToRead:
         fcntl.flock(self._fd, fcntl.LOCK_UN)
         return False
 
-    def read(self, name: str, most: int = MAX_BYTES) -> bytes:
-        """Return the first ``most`` bytes of a file; raise OSError if it is no regular file."""
+    def read(self, name: str, most: int = MAX_BYTES, start: int = 0) -> bytes:
+        """Return at most ``most`` bytes of a file; raise OSError if it is no regular file."""
         fd = os.open(name, _TO_READ, dir_fd=self._fd)
         try:
-            _require_regular(os.fstat(fd).st_mode, name)
+            status = os.fstat(fd)
+            _require_regular(status.st_mode, name)
             with open(fd, "rb", closefd=False) as file:
-                return file.read(most)
+                file.seek(start)
+                return file.read(min(most, status.st_size))  # it gets memory for as much at once
         finally:
             os.close(fd)
 

@@ -52,6 +52,8 @@ class CheckedMap(msgspec.Struct):
         Chunks of which something that was saved is lost: damaged now, or found so before.
     aside
         Damaged databases that were put aside.
+    unknown
+        Those of them of which nothing says what else they had, and why they were put aside.
     rebuilt_from
         Name of the database that a repair put aside; empty without one.
     """
@@ -64,12 +66,13 @@ class CheckedMap(msgspec.Struct):
     damaged: str
     lost: list[LostChunk]
     aside: list[str]
+    unknown: dict[str, str]
     rebuilt_from: str = ""
 
     @property
     def good(self) -> bool:
         """Whether all that was saved is on disk, undamaged."""
-        return not (self.damaged or self.lost)
+        return not (self.damaged or self.lost or self.unknown)
 
     def total(self, what: Literal["bytes", "active", "occupied", "free", "bricks"]) -> int:
         """Return the sum over the good chunks."""
@@ -97,7 +100,7 @@ def check(folder: FolderToRead, path: str) -> CheckedMap:
                         raise
                     del rows[key]
                     lost[key] = Lost(row.version, error.message.removeprefix(f"{error.path}: "))
-            map_id, settings, damaged = stored.map_id.hex(), stored.settings, ""
+            map_id, settings, unknown, damaged = stored.map_id.hex(), stored.settings, stored.unknown, ""
     except MapDataError as error:
         if error.cause != TABLES_DAMAGED:
             raise
@@ -108,7 +111,7 @@ def check(folder: FolderToRead, path: str) -> CheckedMap:
         for key, version in found.names.items():
             if key not in rows or rows[key].version < version:
                 lost[key] = Lost(version, damaged)
-        map_id, settings = record.map_id, record.settings
+        map_id, settings, unknown = record.map_id, record.settings, record.unknown
     return CheckedMap(
         path,
         map_id,
@@ -121,6 +124,7 @@ def check(folder: FolderToRead, path: str) -> CheckedMap:
             for key, one in sorted(lost.items())
         ],
         asides(folder),
+        unknown,
     )
 
 
@@ -148,7 +152,7 @@ def repair(folder: Folder, found: CheckedMap) -> None:
     if found.good:
         return
     _, record = _salvaged(folder, MapDataError("the record is damaged", path=found.path))
-    record.lost = {}
+    record.lost, record.unknown = {}, {}
     _, found.rebuilt_from = rebuild(folder, record, {}, found.damaged or "chunks are lost")
 
 

@@ -96,7 +96,7 @@ class MapDatabase:
     found_lost : collections.deque
         Chunks whose saved bytes were lost since this was last emptied.
     damaged : dict
-        Databases that were put aside since the start, and why.
+        Databases that were put aside, and why: since the start, and those of the record.
     unreadable : dict
         Chunks that cannot be read from the disk at present, and why.
     record : MapRecord
@@ -185,6 +185,7 @@ class MapDatabase:
         with self._changing:
             self.rows, self._numbers, self._next_number = rows, numbers, last + 1
             self.lost = self.record.lost_chunks
+            self.damaged = {**self.record.unknown, **self.damaged}
             self._opened += 1
 
     def _disconnect(self) -> None:

@@ -153,6 +153,9 @@ class MapRecord(msgspec.Struct):
         For each mapper's number, the last scan up to which at least all are durable.
     lost
         Chunks that lost something, by key, until that is forgotten on purpose.
+    unknown
+        Damaged databases that were put aside, and why, where nothing says what else they had; until that is
+        forgotten on purpose.
     damaged
         Numbers of damaged rows, which stay as they are and do not count.
     boot
@@ -168,6 +171,7 @@ class MapRecord(msgspec.Struct):
     runs: Annotated[int, msgspec.Meta(ge=0, lt=(1 << 31) - 1)] = msgspec.field(default=0, name="lives")
     applied: dict[int, Count] = {}
     lost: dict[str, Lost] = {}
+    unknown: dict[str, str] = {}
     damaged: list[Count] = []
     boot: str = ""
 

@@ -10,6 +10,7 @@ import contextlib
 import os
 import secrets
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from itertools import chain
 from typing import Final, NamedTuple
 
@@ -19,7 +20,7 @@ from shmmap.chunks.chunk_file import ChunkFileHeader, check_file
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.errors import BadRequest, MapDataError
 from shmmap.failpoints import step
-from shmmap.live_worker.disk.folder import DAMAGED, INTERIM, Folder, FolderToRead, free_name, named
+from shmmap.live_worker.disk.folder import DAMAGED, INTERIM, MAX_BYTES, Folder, FolderToRead, free_name, named
 from shmmap.live_worker.disk.map_record import (
     MAP_FILE,
     MAP_FORMAT,
@@ -34,7 +35,7 @@ from shmmap.live_worker.disk.map_record import (
     read_map,
 )
 from shmmap.live_worker.disk.old_directory import Chunks, old_files, read_old_chunks
-from shmmap.live_worker.disk.salvage import Log, Pages, Values, index_entries, table_rows
+from shmmap.live_worker.disk.salvage import NO_LOG, Log, Pages, Values, index_entries, table_rows
 from shmmap.live_worker.disk.schema import (
     DATABASE,
     LOG,
@@ -184,11 +185,11 @@ def check_log(folder: FolderToRead) -> None:
 def _checked_log(folder: FolderToRead) -> tuple[Log, str]:
     """Return what counts of the log, and what is wrong with it."""
     try:
-        found = Log(folder.read(LOG))
+        found = Log(min(folder.size(LOG), MAX_BYTES), partial(folder.read, LOG))
     except FileNotFoundError:
-        return Log(b""), ""
+        return NO_LOG, ""
     if _is_foreign(folder, found):
-        return Log(b""), "its log is of another map"
+        return NO_LOG, "its log is of another map"
     # a daemon that runs has its own index of the frames, and goes on
     if not folder.is_in_use() and found.is_damaged(was_cut=not _is_same_boot(folder)):
         return found, "a page of its log is damaged"
@@ -308,8 +309,10 @@ def rebuild(
                 lost[key] = Lost(version, reason)
         record.lost = {key.text: one for key, one in lost.items()}
         record.damaged = []
+        aside = free_name(folder, DATABASE + DAMAGED)
+        if known is None and versions[-1].is_cut:
+            record.unknown[aside] = reason
         make_database(folder, record, _chunks(versions, found))
-    aside = free_name(folder, DATABASE + DAMAGED)
     replace_database(folder, aside)
     log.error(
         "database of a live map rebuilt", kept=aside, chunks=len(found.rows), lost=len(lost), reason=reason

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Final, TypeAlias
 
 import numpy as np
@@ -26,6 +26,7 @@ _INDEX: Final = {10: 0, 2: 4}
 """Pages of an index, with the length of what precedes an entry."""
 _FIRST_PAGE: Final = 100
 """Length of the file's header, on page 1."""
+_MAGIC: Final = b"SQLite format 3\0"
 _MAX_ROW_BYTES: Final = 1 << 28
 _INTEGERS: Final = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8}
 _LOG_HEADER: Final = 32
@@ -33,6 +34,7 @@ _LOG_MAGIC: Final = 0x377F0683
 """First number of a log, apart from the order of bytes in checksums."""
 _FRAME_HEADER: Final = 24
 _FRAME: Final = _FRAME_HEADER + PAGE_BYTES
+_FRAMES_PER_READ: Final = 1024
 _NOT_A_ROW: Final = (IndexError, ValueError, KeyError)
 
 
@@ -42,6 +44,13 @@ class Log:
     A frame's checksum continues that of the one before.  SQLite reads up to the first frame that is not
     right, and drops whatever was committed after it.
 
+    Parameters
+    ----------
+    nbytes
+        Its length.
+    read
+        Returns this many of its bytes, from a place on; fewer at its end.
+
     Attributes
     ----------
     count
@@ -50,21 +59,28 @@ class Log:
         Number of frames that SQLite reads.
     """
 
-    def __init__(self, data: bytes) -> None:
-        self._data = data = data.ljust(_LOG_HEADER, b"\0")
-        header = np.frombuffer(data, np.uint32, _LOG_HEADER // 4)[np.newaxis]
+    def __init__(self, nbytes: int, read: Callable[[int, int], bytes]) -> None:
+        self._read = read
+        header = np.frombuffer(self._at(0, _LOG_HEADER), np.uint32)[np.newaxis]
         first = header.view(">u4")
         is_right = (_checksums(header[:, :6], np.zeros_like(header)) == first[:, 6:]).all()
         has_header = bool(is_right and first[0, 0] | 1 == _LOG_MAGIC)
-        self.count = (len(data) - _LOG_HEADER) // _FRAME
+        self.count = max(0, nbytes - _LOG_HEADER) // _FRAME
         if self.count == 1 and not has_header:
             self.count = 0  # both are on one page
-        words = np.frombuffer(data, np.uint32, self.count * _FRAME // 4, _LOG_HEADER)
-        frames = words.reshape(self.count, _FRAME // 4)
-        fields = frames[:, : _FRAME_HEADER // 4].view(">u4")
-        self._numbers, pages, salts, sums = fields[:, 0], fields[:, 1], fields[:, 2:4], fields[:, 4:6]
-        before = np.concatenate([first[:, 6:], sums])[: self.count]
-        is_right = (_checksums(np.delete(frames, slice(2, 6), axis=1), before) == sums).all(axis=1)
+        fields = np.empty((self.count, _FRAME_HEADER // 4), ">u4")
+        is_right = np.empty(self.count, bool)
+        before = first[:, 6:]
+        for begin in range(0, self.count, _FRAMES_PER_READ):
+            part = slice(begin, min(begin + _FRAMES_PER_READ, self.count))
+            data = self._at(_LOG_HEADER + begin * _FRAME, (part.stop - begin) * _FRAME)
+            frames = np.frombuffer(data, np.uint32).reshape(-1, _FRAME // 4)
+            fields[part] = frames[:, : _FRAME_HEADER // 4].view(">u4")
+            sums = np.concatenate([before, fields[part, 4:6]])
+            found = _checksums(np.delete(frames, slice(2, 6), axis=1), sums[:-1])
+            is_right[part] = (found == sums[1:]).all(axis=1)
+            before = sums[-1:]
+        self._numbers, pages, salts = fields[:, 0], fields[:, 1], fields[:, 2:4]
         is_current = (salts == (first[:, 4:6] if has_header else salts[1:2])).all(axis=1)
         is_good = is_right & is_current
         follows_good = np.concatenate([[has_header], is_good])[: self.count]
@@ -92,7 +108,8 @@ class Log:
         """Whether the first frame that is not right is on a page that the disk never got: it is zeros."""
         begin = _LOG_HEADER + self._good * _FRAME
         pages = range(begin - begin % PAGE_BYTES, begin + _FRAME, PAGE_BYTES)
-        return any(not any(self._data[max(begin, page) : page + PAGE_BYTES]) for page in pages)
+        parts = ((max(begin, page), page + PAGE_BYTES) for page in pages)
+        return any(not any(self._read(end - start, start)) for start, end in parts)
 
     def newest(self, frames: int) -> dict[int, int]:
         """Return where in these first frames the newest version of each page is."""
@@ -101,8 +118,10 @@ class Log:
 
     def page(self, frame: int) -> bytes:
         """Return the page in a frame."""
-        begin = _LOG_HEADER + frame * _FRAME + _FRAME_HEADER
-        return self._data[begin : begin + PAGE_BYTES]
+        return self._at(_LOG_HEADER + frame * _FRAME + _FRAME_HEADER, PAGE_BYTES)
+
+    def _at(self, start: int, nbytes: int) -> bytes:
+        return self._read(nbytes, start).ljust(nbytes, b"\0")
 
 
 def _checksums(words: NDArray[np.uint32], before: NDArray[np.uint32]) -> NDArray[np.uint32]:
@@ -112,6 +131,10 @@ def _checksums(words: NDArray[np.uint32], before: NDArray[np.uint32]) -> NDArray
         first = first + words[:, at] + second
         second = second + words[:, at + 1] + first
     return np.stack([first, second], axis=1)
+
+
+NO_LOG: Final = Log(0, lambda _nbytes, _start: b"")
+"""That of a database without one."""
 
 
 class Pages:
@@ -127,9 +150,10 @@ class Pages:
         self._database, self._log = database, log
         self._in_log = log.newest(frames)
         self.numbers: Iterable[int] = self._in_log
-        self._count = max(self._in_log, default=0)
+        self._count, self._in_file = max(self._in_log, default=0), 0
         if database is not None:
-            self._count = os.fstat(database).st_size // PAGE_BYTES + log.count
+            self._in_file = os.fstat(database).st_size // PAGE_BYTES
+            self._count = self._in_file + log.count
             self.numbers = range(1, self._count + 1)
 
     def __getitem__(self, number: int) -> bytes:
@@ -144,6 +168,13 @@ class Pages:
             with contextlib.suppress(OSError):
                 found = os.pread(self._database, PAGE_BYTES, (number - 1) * PAGE_BYTES)
         return found.ljust(PAGE_BYTES, b"\0")
+
+    @property
+    def is_cut(self) -> bool:
+        """Whether there is no header, or some page is missing of those that it counts."""
+        header = self[1] if self._count else b""
+        missing = range(self._in_file + 1, int.from_bytes(header[28:32], "big") + 1)
+        return not header.startswith(_MAGIC) or any(number not in self._in_log for number in missing)
 
 
 def table_rows(pages: Pages) -> Iterator[tuple[int, Values]]:

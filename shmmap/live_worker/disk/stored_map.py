@@ -8,9 +8,11 @@ has the daemon to keep its log.
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import sqlite3
 from collections.abc import Iterator
+from typing import Final
 
 from shmmap.chunks.chunk_file import decode_chunk
 from shmmap.chunks.layout import ChunkView
@@ -33,6 +35,11 @@ from shmmap.live_worker.disk.schema import (
     valid_rows,
 )
 
+_HINTS: Final = {
+    **dict.fromkeys((errno.EACCES, errno.EPERM), "the user whom the daemon runs as may, and root"),
+    errno.EINVAL: "move it away, and bring the file back, if it was there",
+}
+
 
 class StoredMap:
     """A live map's settings, and its chunks one by one.
@@ -50,6 +57,8 @@ class StoredMap:
         As in the map's record.
     rows, lost
         As in `MapDatabase`.
+    unknown
+        As in `MapRecord`.
 
     Raises
     ------
@@ -73,7 +82,7 @@ class StoredMap:
             check_tables(self._database)
             record = read_record(self._database)
             self.map_id, self.settings = bytes.fromhex(record.map_id), record.settings
-            self.lost = record.lost_chunks
+            self.lost, self.unknown = record.lost_chunks, record.unknown
             self.rows, self._numbers, _ = read_rows(self._database, record)
 
     def chunk(self, key: ChunkKey) -> ChunkView:
@@ -112,7 +121,7 @@ class StoredMap:
                 f"it cannot be read: {error.strerror}",
                 path=path,
                 cause="unreadable",
-                hint="the user whom the daemon runs as may, and root",
+                hint=_HINTS.get(error.errno or 0, "is its disk well?"),
             ) from error
         except MapDataError as error:
             raise MapDataError(

@@ -12,6 +12,7 @@ proxy (``https_proxy``, ``http_proxy``), redirects are for the proxy to refuse.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import threading
 import time
@@ -20,7 +21,7 @@ from datetime import timedelta
 from hashlib import sha256
 from typing import Any, Final, TypeVar
 
-from shmmap.errors import ConfigError, MapDataError, MapMissing
+from shmmap.errors import ConfigError, MapDataError, MapMissing, Offline
 from shmmap.lazy_imports import FOR_REMOTE, needed_packages
 from shmmap.origin.remote.bucket_errors import NOWHERE, failure, missing, refuse_unread
 from shmmap.origin.remote.conditions import (
@@ -236,18 +237,27 @@ class BucketStore:
 
     def put_new(self, path: str, data: bytes) -> bool:
         """Write an object if none exists at this path."""
-        return self.write(path, data, create=True) is not None or self._has(path, data)
+        return self._is_written(path, data, lambda: self.write(path, data, create=True))
 
     def put_if(self, path: str, data: bytes, tag: Tag) -> bool:
         """Replace an object if it is still in the state that ``tag`` names."""
         refuse_unsafe_tag(self.url, tag)
         try:
-            return self.write(path, data, tag) is not None or self._has(path, data)
+            return self._is_written(path, data, lambda: self.write(path, data, tag))
         except MapMissing:
             return False
 
+    def _is_written(self, path: str, data: bytes, write: Callable[[], Tag | None]) -> bool:
+        """Write an object; return whether it has ``data`` then: the answer may have been lost."""
+        try:
+            return write() is not None or self._has(path, data)
+        except Offline:
+            with contextlib.suppress(Offline):
+                if self._has(path, data):
+                    return True
+            raise
+
     def _has(self, path: str, data: bytes) -> bool:
-        """Whether an object already has ``data``: the reply to an earlier attempt may have been lost."""
         try:
             return bytes(self.get(path, len(data))) == data
         except (MapMissing, MapDataError):

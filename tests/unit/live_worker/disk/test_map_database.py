@@ -11,6 +11,7 @@ import shutil
 import sqlite3
 import struct
 import threading
+import tracemalloc
 import zlib
 from collections.abc import Callable, Container, Iterable, Iterator
 from contextlib import closing, contextmanager, suppress
@@ -26,10 +27,11 @@ from shmmap.chunks.voxels import ChunkKey
 from shmmap.errors import ConfigError, MapDataError
 from shmmap.live_worker.disk import map_database, schema
 from shmmap.live_worker.disk.folder import Folder, FolderToRead
-from shmmap.live_worker.disk.maintenance import check
+from shmmap.live_worker.disk.maintenance import CheckedMap, check, repair
 from shmmap.live_worker.disk.map_database import SCANS_AHEAD, MapDatabase
 from shmmap.live_worker.disk.map_record import MapSettings, Row
 from shmmap.live_worker.disk.rebuilding import NEW, finish_replacing, replace_database
+from shmmap.live_worker.disk.stored_map import opened_folder_to_read
 from shmmap.mounts import Mount
 from tests.support.odd_files import ODD_FILES, failing
 from tests.support.pages import read_page
@@ -72,6 +74,12 @@ def loaded(made: MapDatabase, keys: Iterable[ChunkKey]) -> dict[ChunkKey, bytes 
     """What the map has of these chunks."""
     found = {key: made.load(key) for key in keys}
     return {key: bytes(data) if data is not None else None for key, data in found.items()}
+
+
+def checked(directory: Path) -> CheckedMap:
+    """Check a map, as any process may."""
+    with opened_folder_to_read(str(directory)) as folder:
+        return check(folder, str(directory))
 
 
 def version_of(made: MapDatabase, key: ChunkKey) -> int:
@@ -167,8 +175,12 @@ def test_what_is_no_regular_file_keeps_the_map_closed(tmp_path: Path, name: str,
         path.rename(tmp_path / "kept")
     ODD_FILES[kind](path)
     before = files_of(tmp_path)
-    with pytest.raises(OSError, match=f"{name} cannot be read: it is a"), opened(tmp_path):
+    with pytest.raises(OSError, match=f"{name}: it is a"), opened(tmp_path):
         pass
+    if name != "map.json":
+        with pytest.raises(MapDataError, match=rf"{name}: it is a .* \(move it away") as refused:
+            checked(tmp_path)
+        assert refused.value.cause == "unreadable"
     assert files_of(tmp_path) == before
 
 
@@ -524,6 +536,21 @@ def test_a_damaged_page_of_the_log_costs_at_most_four_chunks(
         shutil.rmtree(copy)
 
 
+def test_a_log_of_any_length_takes_little_memory(tmp_path: Path) -> None:
+    with opened(tmp_path) as made:
+        made.save(KEYS[0], chunk(made, KEYS[0], 3))
+    (tmp_path / "map.db-wal").write_bytes(b"")
+    os.truncate(tmp_path / "map.db-wal", 64 << 20)
+    tracemalloc.start()
+    try:
+        found = checked(tmp_path)
+        _, most = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert (found.damaged, list(found.rows)) == ("a page of its log is damaged", [KEYS[0]])
+    assert most < 32 << 20
+
+
 def test_a_log_of_another_map_is_put_aside(tmp_path: Path, any_body: None) -> None:
     """SQLite would overwrite the database with it; what was in its place is not there."""
     saved = stored(tmp_path / "map", 60, random.Random(1))
@@ -573,6 +600,15 @@ def test_a_database_that_is_shorter_or_no_database(tmp_path: Path, any_body: Non
             assert list(made.damaged) == ["map.db.damaged.1"]
             assert all(data == saved[key] for key, data in loaded(made, made.rows).items())
         assert (tmp_path / name / "map.db.damaged.1").read_bytes() == damaged
+        with opened(tmp_path / name) as again:
+            assert again.losses(9)[1] > 0, "nothing says what it had: it is named by each run"
+        found = checked(tmp_path / name)
+        assert (list(found.unknown), found.good) == (["map.db.damaged.1"], False)
+        with closing(Folder(tmp_path / name)) as folder:
+            repair(folder, found)
+        assert checked(tmp_path / name).good, "until it is forgotten on purpose"
+        with opened(tmp_path / name) as forgotten:
+            assert forgotten.losses(9) == ((), 0)
 
 
 def test_the_record_is_in_the_copy_where_the_first_page_is_damaged(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from shmmap.errors import BadRequest, CannotWrite, ShmmapError
+from shmmap.errors import BadRequest, CannotWrite, Offline, ShmmapError
 from tests.support.map_stores import BucketServer
 from tests.support.store_proxy import (
     IGNORING,
@@ -342,3 +342,32 @@ def test_what_stores_say_of_a_bucket(
         assert hint in caught.value.hint
         assert caught.value.exit_code == code
         assert server.requests()
+
+
+def test_a_write_is_done_whose_answer_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing asks twice for a write on a condition; what the store has is looked at."""
+    kept: dict[str, bytes] = {}
+
+    def rule(asked: Asked, _forward: Forward) -> Answer:
+        if asked.method == "PUT":
+            if "lost" in asked.path:
+                kept[asked.path] = asked.body
+            return Answer(500)  # by what is in between
+        if asked.path not in kept:
+            return Answer(404)
+        headers = {"etag": '"a"', "last-modified": "Thu, 01 Jan 2026 00:00:00 GMT"}
+        return Answer(200, headers, kept[asked.path])
+
+    with closing(StoreProxy("http://127.0.0.1:9")) as server:
+        server.rule = rule
+        monkeypatch.setenv("AWS_ENDPOINT_URL", server.endpoint)
+        for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+            monkeypatch.setenv(name, "account")
+        store = open_store("s3://some/map", timeouts=ONCE)
+        assert store.put_new("lost", b"1")
+        assert store.put_if("lost", b"2", {"e_tag": '"a"'})
+        with pytest.raises(Offline, match="status 500"):
+            store.put_new("refused", b"1")
+        server.rule = lambda *_: Answer(500)
+        with pytest.raises(Offline, match="lost: refused"):
+            store.put_new("lost", b"2")
