@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import struct
 from dataclasses import dataclass, field
@@ -103,13 +104,25 @@ def make_map(
     """Make a map of columns x rows cells, its middle at the origin."""
     made = DividedMap(root, float(size))
     made.pcd_dir.mkdir(parents=True)
-    rng = np.random.default_rng(seed)
-    for i in range(columns):
-        for j in range(rows):
-            corner = ((i - columns // 2) * size, (j - rows // 2) * size)
-            made.write_cell(f"{corner[0]}_{corner[1]}.pcd", corner, random_points(rng, corner, points, size))
+    for corner, data in _cells(columns, rows, points, seed, size):
+        name = f"{corner[0]}_{corner[1]}.pcd"
+        made.corners[name] = corner
+        with open(f"{made.pcd_dir}/{name}", "wb") as file:
+            file.write(data)
     made.write_metadata()
     return made
+
+
+@functools.lru_cache(4)  # nearly all tests have one of these maps
+def _cells(
+    columns: int, rows: int, points: int, seed: int, size: int
+) -> tuple[tuple[tuple[int, int], bytes], ...]:
+    """Return each cell's corner and file."""
+    rng = np.random.default_rng(seed)
+    corners = [
+        ((i - columns // 2) * size, (j - rows // 2) * size) for i in range(columns) for j in range(rows)
+    ]
+    return tuple((corner, pcd_bytes(random_points(rng, corner, points, size))) for corner in corners)
 
 
 # A small PCD writer and reader for tests, independent of shmmap's
@@ -120,6 +133,11 @@ _KIND = {"f": "F", "i": "I", "u": "U"}
 
 def write_pcd(path: Path, columns: dict[str, NDArray[Any]]) -> None:
     """Write one-dimensional columns, in order, as a binary PCD; in place, without a temporary file."""
+    path.write_bytes(pcd_bytes(columns))
+
+
+def pcd_bytes(columns: dict[str, NDArray[Any]]) -> bytes:
+    """Return the file that `write_pcd` writes."""
     names = list(columns)
     rows = len(columns[names[0]])
     record = np.zeros(rows, dtype=[(name, columns[name].dtype) for name in names])
@@ -138,7 +156,7 @@ def write_pcd(path: Path, columns: dict[str, NDArray[Any]]) -> None:
         f"POINTS {rows}",
         "DATA binary",
     ]
-    path.write_bytes("\n".join(lines).encode() + b"\n" + record.tobytes())
+    return "\n".join(lines).encode() + b"\n" + record.tobytes()
 
 
 def read_pcd(path: Path) -> dict[str, NDArray[Any]]:

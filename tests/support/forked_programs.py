@@ -36,7 +36,7 @@ from typing import IO, Any, Final, NoReturn
 
 from shmmap.installed import refuse_if_replaced
 from shmmap.processes.end_with_parent import die_with
-from shmmap.processes.start_child import channel
+from shmmap.processes.start_child import ForkedProcess, channel
 from tests.support.kernels_once import watch
 
 ROOT: Final = Path(__file__).resolve().parents[2]
@@ -130,15 +130,37 @@ def fork_program(
     return _Adopted(pid, [sys.executable, "-m", module, *words])
 
 
+def fork_child(module: str) -> tuple[ForkedProcess, socket.socket] | None:
+    """Do what `shmmap.processes.start_child.fork_child` does, for a process that has threads and sockets."""
+    server = _ready_for(os.environ)
+    if server is None:
+        return None
+    ours, theirs = channel()
+    request = _request(module, (), os.environ, "/", adopted=True, program=os.getpid())
+    try:
+        with theirs, _adopting():
+            return ForkedProcess(server.ask(request, [theirs.fileno(), 2])), ours
+    finally:
+        server.lock.release()
+
+
 def _request(
-    module: str, words: Sequence[str], environment: Mapping[str, str], cwd: str, *, adopted: bool
+    module: str,
+    words: Sequence[str],
+    environment: Mapping[str, str],
+    cwd: str,
+    *,
+    adopted: bool,
+    program: int = 0,
 ) -> dict[str, Any]:
+    """Describe a process; ``program`` is the one that it is a child of, with a channel to it."""
     return {
         "module": module,
         "words": list(words),
         "environment": dict(environment),
         "cwd": cwd,
         "adopted": adopted,
+        "program": program,
     }
 
 
@@ -379,7 +401,7 @@ class _Stem:
             os.close(nowhere)
             os.chdir("/")
             theirs.send(b"ready")
-            _fork_workers(theirs, program)
+            _fork_workers(theirs)
         theirs.close()
         self._socket.recv(64)
         self._lock = threading.Lock()
@@ -390,29 +412,29 @@ class _Stem:
         """Do what `shmmap.processes.start_child.start_child` does."""
         refuse_if_replaced(module)
         ours, theirs = channel()
-        request = _request(module, arguments, os.environ, "/", adopted=new_session)
+        request = _request(module, arguments, os.environ, "/", adopted=new_session, program=os.getpid())
         with self._lock, theirs, _adopting():
             socket.send_fds(self._socket, [json.dumps(request).encode()], [theirs.fileno(), 2])
             pid = int(self._socket.recv(64))
         return _Adopted(pid, [sys.executable, "-m", module]), ours
 
 
-def _fork_workers(requests: socket.socket, program: int) -> NoReturn:
+def _fork_workers(requests: socket.socket) -> NoReturn:
     """Fork workers of a program, whenever it asks for one."""
     while True:
         data, fds, _, _ = socket.recv_fds(requests, _REQUEST_BYTES, _FDS)
         if not data:
             os._exit(0)  # the program has ended
-        pid = _fork_for_adoption(partial(_work, json.loads(data), fds, requests, program))
+        pid = _fork_for_adoption(partial(_work, json.loads(data), fds, requests))
         requests.send(str(pid).encode())
         for fd in fds:
             os.close(fd)
 
 
-def _work(request: dict[str, Any], fds: list[int], requests: socket.socket, program: int) -> NoReturn:
+def _work(request: dict[str, Any], fds: list[int], requests: socket.socket) -> NoReturn:
     """Be a worker of a program, once this fork is its child; ``fds``: its socket and the program's stderr."""
     requests.close()
-    fd, errors = fds
+    (fd, errors), program = fds, request["program"]
     end_s = time.monotonic() + _ADOPTED_S
     while os.getppid() != program and time.monotonic() < end_s:
         time.sleep(0.0005)
@@ -442,8 +464,9 @@ def main() -> None:
         data, fds, _, _ = socket.recv_fds(requests, _REQUEST_BYTES, _FDS)
         if not data:
             return
-        start = partial(_start, json.loads(data), fds, requests)
-        if start.args[0]["adopted"]:
+        request = json.loads(data)
+        start = partial(_work if request["program"] else _start, request, fds, requests)
+        if request["adopted"]:
             answer = _fork_for_adoption(start)
         else:
             pid = os.fork()

@@ -28,21 +28,20 @@ def brute_force(
     points: NDArray[Any], rule: CompareRule, clouds: list[NDArray[Any]], centroids: list[NDArray[Any]]
 ) -> NDArray[np.bool_]:
     """Whether each point (map frame) is explained, by comparing it with everything there is."""
-    p = points.astype(np.float64)
-    cloud = np.concatenate([c.astype(np.float64) for c in clouds])
-    d, d_z = rule.distance, rule.distance * rule.z_ratio
-    result = np.zeros(len(p), np.bool_)
-    for n, place in enumerate(p):
+    d = rule.distance
+    d_z = d * rule.z_ratio
+    scale = np.array([1 / d, 1 / d, 1 / d_z])
+    everything = np.concatenate(centroids if rule.mode == "voxel" else clouds).astype(np.float64).T.copy()
+    voxels = np.floor(everything * scale[:, None]) if rule.mode == "voxel-distance" else None
+    result = np.zeros(len(points), np.bool_)
+    for n, place in enumerate(points.astype(np.float64)):
+        x, y, z = everything - place[:, None]
         if rule.mode == "voxel":
-            for mean in centroids:
-                away = np.abs(mean.astype(np.float64) - place)
-                result[n] |= bool(((away[:, 0] < d) & (away[:, 1] < d) & (away[:, 2] < d_z)).any())
+            result[n] = ((np.abs(x) < d) & (np.abs(y) < d) & (np.abs(z) < d_z)).any()
             continue
-        away = cloud - place
-        result[n] = bool(((away**2).sum(axis=1) <= d * d).any())
-        if rule.mode == "voxel-distance":
-            scale = np.array([1 / d, 1 / d, 1 / d_z])
-            result[n] |= bool((np.floor(cloud * scale) == np.floor(place * scale)).all(axis=1).any())
+        result[n] = (x * x + y * y + z * z <= d * d).any()
+        if voxels is not None:
+            result[n] |= (voxels == np.floor(place * scale)[:, None]).all(axis=0).any()
     return result
 
 

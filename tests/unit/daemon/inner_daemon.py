@@ -20,6 +20,7 @@ from typing import Any
 import msgspec
 
 from shmmap.daemon.config import DaemonConfig
+from shmmap.daemon.loading import parent_main
 from shmmap.daemon.loading.link import Link
 from shmmap.daemon.loading.worker_messages import Job
 from shmmap.daemon.map_in_memory import FROM_FILES, FetchedFrom, MapInMemory
@@ -46,6 +47,7 @@ from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import prepare_process
 from tests.support import connections
 from tests.support.daemon_process import stop
+from tests.support.forked_programs import fork_child
 
 TIMEOUT_S = 240.0
 FETCHED_BYTES = 100_000
@@ -113,8 +115,9 @@ class InnerDaemon:
         pins = PinWatch(self.directory, events=True)
         self.jobs: list[Job] = []
         fetched = FetchedFrom((), 1, link, self._needed_bytes) if link else FROM_FILES
+        catalogue, early = self.origin.load(), fork_child(parent_main.__name__)
         self.memory = memory = MapInMemory(
-            config, self.origin.load(), self.directory, pins, "", 0o400, -1, None, fetched, clock=self.now_s
+            config, catalogue, self.directory, pins, "", 0o400, -1, early, fetched, clock=self.now_s
         )
         self.cache, self.scheduler, self.sessions = memory.cache, memory.scheduler, memory.sessions
         self.statistics, self.event_log, self.watched = memory.statistics, memory.event_log, memory.watched

@@ -18,6 +18,7 @@ from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.host.scheduling import take_slices
 from shmmap.daemon.host.signals import StartSignals
 from shmmap.daemon.live_relay import NoLiveMaps
+from shmmap.daemon.loading import parent_main
 from shmmap.daemon.map.catalogue_reload import Reloader
 from shmmap.daemon.map.catalogue_view import ViewOrigin
 from shmmap.daemon.map_in_memory import MapInMemory
@@ -28,6 +29,7 @@ from shmmap.protocol import messages as m
 from shmmap.protocol.codec import decode_reply, encode
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import prepare_process
+from tests.support.forked_programs import fork_child
 
 HELLO = m.Hello(1, *m.PROTOCOL_VERSION, "walker")
 TIMEOUT_S = 240.0
@@ -58,7 +60,8 @@ class WholeDaemon:
         config = DaemonConfig(map_path=str(map_path), instance="walk", shm_dir=shm_dir, workers=1, **settings)
         directory = ShmDirectory(shm_dir)
         origin = origin or open_map(str(map_path), cache_dir=scratch)
-        self.memory = MapInMemory(config, origin.load(), directory, PinWatch(directory), path, 0o400, -1)
+        catalogue, pins, early = origin.load(), PinWatch(directory), fork_child(parent_main.__name__)
+        self.memory = MapInMemory(config, catalogue, directory, pins, path, 0o400, -1, early)
         signals = cast("StartSignals", SimpleNamespace(keep=False, reload_wanted=False))
         reloader = Reloader(origin, lambda: self.memory.cache.catalogue)
         self.service = Service(

@@ -62,7 +62,6 @@ def never_here(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("never_here")
-@pytest.mark.parametrize("fresh", [False, True])
 @pytest.mark.parametrize(
     ("more", "message"),
     [
@@ -80,10 +79,10 @@ def never_here(monkeypatch: pytest.MonkeyPatch) -> None:
     ],
     ids=lambda value: value[:16].strip(),
 )  # fmt: skip
-def test_endless_metadata_is_refused_in_a_few_words(root: Path, more: str, message: str, fresh: bool) -> None:
+def test_endless_metadata_is_refused_in_a_few_words(root: Path, more: str, message: str) -> None:
     write_metadata(root, more)
     with pytest.raises(MapDataError, match=message) as caught:
-        origin(root).load(fresh=fresh)
+        origin(root).load()
     error = caught.value
     assert error.path == str(root / "pointcloud_map_metadata.yaml")
     assert str(error).startswith(error.path)
