@@ -167,7 +167,7 @@ class EvictionPlan:
         return len(heap) == MAX_LISTED and heap[0].is_past_grace and heap[0].score > score
 
     def _segments_of(self, square: Square, block: int) -> Iterator[list[Resident]]:
-        """Yield a square's segments in parts, and learn what is known of them anew."""
+        """Yield the segments of a square in parts, and learn again what is known of them."""
         segments = iter(list(square.segments))
         square.forget()
         self.work += SQUARE_WORK
