@@ -29,7 +29,7 @@ _BLOCK_CELLS = 4096
 _HASHED_BYTES = 1 << 20
 
 # Cells that are compared at a time, so that no other table is as long as the map.
-_COMPARED_CELLS = 1 << 15
+_COMPARED_CELLS = 1 << 12
 
 
 class CellIds(Protocol):
@@ -314,10 +314,12 @@ class Catalogue:
 
 def compare(old: Catalogue, new: Catalogue) -> CatalogueChange:
     """Return the changes from ``old`` to ``new``, without a Python loop over all cells."""
-    kept = np.zeros(len(old.names), np.bool_)
+    names = new.names
+    same = old.id_prefix == new.id_prefix and (names is old.names or np.array_equal(names, old.names))
+    kept = np.full(len(old.names), same)
     nothing = np.empty(0, np.intp)
     added, changed, moved = [nothing], [nothing], [nothing]
-    for in_old, in_new in _matched(old, new):
+    for in_old, in_new in _differing(old, new) if same else _matched(old, new):
         there = in_old >= 0
         added.append(in_new[~there])
         in_old, in_new = in_old[there], in_new[there]
@@ -336,16 +338,24 @@ def compare(old: Catalogue, new: Catalogue) -> CatalogueChange:
     )
 
 
+def _differing(old: Catalogue, new: Catalogue) -> Iterator[tuple[Indices, Indices]]:
+    """Yield indices of two catalogues of the same names, block by block, without blocks that are the same.
+
+    Nearly all blocks are the same in a reload, and other threads wait for the interpreter lock meanwhile.
+    """
+    for begin in range(0, len(new), _COMPARED_CELLS):
+        cells = slice(begin, begin + _COMPARED_CELLS)
+        same_boxes = new.boxes is old.boxes or np.array_equal(new.boxes[cells], old.boxes[cells])
+        if not (same_boxes and np.array_equal(new.stamps[cells], old.stamps[cells])):
+            block = np.arange(begin, min(begin + _COMPARED_CELLS, len(new)))
+            yield block, block
+
+
 def _matched(old: Catalogue, new: Catalogue) -> Iterator[tuple[Indices, Indices]]:
     """Yield matching indices of old (-1: no such cell) and new catalogue, block by block."""
-    names = new.names
-    same = old.id_prefix == new.id_prefix and (names is old.names or np.array_equal(names, old.names))
-    for begin in range(0, len(names), _COMPARED_CELLS):
-        in_new = np.arange(begin, min(begin + _COMPARED_CELLS, len(names)))
-        if same:
-            yield in_new, in_new
-        else:
-            yield _places(old.names, _below(old.id_prefix, new.id_prefix, names[in_new])), in_new
+    for begin in range(0, len(new), _COMPARED_CELLS):
+        in_new = np.arange(begin, min(begin + _COMPARED_CELLS, len(new)))
+        yield _places(old.names, _below(old.id_prefix, new.id_prefix, new.names[in_new])), in_new
 
 
 def _below(directory: str, prefix: str, names: NDArray[np.bytes_]) -> NDArray[np.bytes_]:

@@ -8,11 +8,13 @@ other thread runs.  The process writes its result into a pipe: an error, or the 
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import os
-import subprocess
+import signal
 import sys
 from collections.abc import Sequence
-from typing import IO, Final, cast
+from typing import Final
 
 import msgspec
 
@@ -21,9 +23,16 @@ from shmmap.installed import refuse_if_replaced
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.catalogue_bytes import read_catalogue
 from shmmap.processes.start_child import how_ended
+from shmmap.processes.start_program import start_program
 
 _PIPE_BYTES: Final = 1 << 20
 """The largest pipe that every user may have; a larger pipe needs fewer reads."""
+_PROGRAM: Final = """\
+import os, sys
+os.chdir("/")  # nothing is imported from this process's directory
+from shmmap.origin.reread import main
+sys.exit(main(sys.argv[1:]))
+"""
 
 
 class Outcome(msgspec.Struct):
@@ -81,33 +90,29 @@ def read_apart(
     paths = os.pathsep.join(filter(None, sys.path))
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": paths}
     known = f"{before.fixed_digest:016x}" if before is not None else ""
-    command = [sys.executable, "-m", "shmmap.origin.reread", str(os.getpid()), words, known]
-    try:
-        process = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            env=environment,
-            cwd="/",
-            pipesize=_PIPE_BYTES,
-            pass_fds=descriptors,
-        )
-    except OSError as error:
-        raise not_started(map_path, "reads", error) from error
-    try:
-        with cast("IO[bytes]", process.stdout) as pipe:
+    command = [sys.executable, "-c", _PROGRAM, str(os.getpid()), words, known]
+    ours, theirs = os.pipe2(os.O_CLOEXEC)
+    with open(ours, "rb") as pipe:
+        try:
+            with contextlib.suppress(OSError):  # this user's pipes are large already
+                fcntl.fcntl(ours, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
+            pid = start_program(command, environment, theirs, descriptors)
+        except OSError as error:
+            raise not_started(map_path, "reads", error) from error
+        finally:
+            os.close(theirs)
+        try:
             if line := pipe.readline():
                 outcome = _OUTCOME.decode(line)
                 if outcome.error:
                     raise outcome.raised()
                 return read_catalogue(pipe, before=before)[1]
-    except (ValueError, msgspec.MsgspecError):  # the process ended before it had written everything
-        pass
-    finally:
-        process.kill()
-        process.wait()
-    raise ended_early(map_path, "reads", process.returncode)
+        except (ValueError, msgspec.MsgspecError):  # the process ended before it had written everything
+            pass
+        finally:
+            os.kill(pid, signal.SIGKILL)
+            code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+    raise ended_early(map_path, "reads", code)
 
 
 def not_started(what: str, does: str, error: OSError) -> ShmmapError:

@@ -54,7 +54,6 @@ class Reloader:
         self.origin = origin
         self._served = served
         self.fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
-        self._thread: threading.Thread | None = None
         self._result: Reread | ShmmapError | None = None
         self._asked: list[Answer] = []
         self._next: list[Answer] = []
@@ -69,11 +68,10 @@ class Reloader:
 
     def _begin(self) -> None:
         self._asked, self._next = self._next, []
-        self._thread = threading.Thread(target=self._load, args=(self._served(),), name="reload", daemon=True)
+        thread = threading.Thread(target=self._load, args=(self._served(),), name="reload", daemon=True)
         try:
-            self._thread.start()
+            thread.start()
         except RuntimeError as error:  # the limit of threads is reached
-            self._thread = None
             self._result = ShmmapError(
                 f"{self.origin.path}: {error}", hint="raise the limit of processes (TasksMax=, ulimit -u)"
             )
@@ -96,9 +94,6 @@ class Reloader:
     def collect(self, apply: Apply, failed: Callable[[ShmmapError], None]) -> None:
         """Apply a finished load, answer its callers, and start the next load if one was requested."""
         os.eventfd_read(self.fd)
-        if self._thread is not None:
-            self._thread.join()
-            self._thread = None
         result, asked = self._result, self._asked
         self._result, self._asked = None, []
         if isinstance(result, ShmmapError):

@@ -7,7 +7,7 @@ import io
 import json
 import os
 import struct
-import subprocess
+import sys
 import tracemalloc
 from pathlib import Path
 from typing import Any
@@ -129,12 +129,9 @@ def test_a_process_that_ends_before_it_is_done(root: Path) -> None:
 
 
 def test_no_process_is_to_be_had(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: Any, **__: Any) -> Any:
-        raise OSError(11, "Resource temporarily unavailable")
-
     write_metadata(root, "#" * LONG)
-    monkeypatch.setattr(subprocess, "Popen", refuse)
-    with pytest.raises(ShmmapError, match="cannot start a process that reads it: Resource temp") as caught:
+    monkeypatch.setattr(sys, "executable", str(root / "nowhere"))
+    with pytest.raises(ShmmapError, match="cannot start a process that reads it: No such file") as caught:
         origin(root).load(fresh=True)
     assert "raise the limit" in caught.value.hint
 
@@ -293,3 +290,14 @@ def test_another_state_takes_what_is_new_and_no_further_table(
     peak, count = peak_of(out.getvalue(), before)
     assert count == differing
     assert peak < CELLS * (24 + bytes_a_cell) + (6 << 20)
+
+
+def test_cells_that_are_the_same_are_not_copied() -> None:
+    """Other threads wait for the interpreter lock meanwhile."""
+    before, after = many(1_000_000), many(1_000_000)
+    tracemalloc.start()
+    try:
+        assert not compare(before, after)
+        assert tracemalloc.get_traced_memory()[1] < CELLS + (1 << 18)
+    finally:
+        tracemalloc.stop()

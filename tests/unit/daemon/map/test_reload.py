@@ -10,6 +10,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
+from types import FrameType
 
 import pytest
 
@@ -208,3 +209,22 @@ def test_no_thread_is_to_be_had(reloader: Reloader, monkeypatch: pytest.MonkeyPa
     reloader.ask(answers.append)
     collect(reloader)
     assert isinstance(answers[1], Reread)
+
+
+def test_the_loop_does_not_wait_for_the_thread_to_end(reloader: Reloader) -> None:
+    """A thread that has its result may still wait for a processor."""
+    may_end, ended, answers = threading.Event(), list[bool](), list[Result]()
+
+    def stay(frame: FrameType, event: str, _argument: object) -> None:
+        if event == "return" and frame.f_code is Reloader._load.__code__:
+            ended.append(may_end.wait(5.0))
+
+    threading.setprofile(stay)
+    try:
+        reloader.ask(answers.append)
+    finally:
+        threading.setprofile(None)
+    collect(reloader)
+    assert len(answers) == 1
+    assert not ended
+    may_end.set()
