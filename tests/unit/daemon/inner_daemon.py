@@ -116,9 +116,15 @@ class InnerDaemon:
         self.jobs: list[Job] = []
         fetched = FetchedFrom((), 1, link, self._needed_bytes) if link else FROM_FILES
         catalogue, early = self.origin.load(), fork_child(parent_main.__name__)
-        self.memory = memory = MapInMemory(
-            config, catalogue, self.directory, pins, "", 0o400, -1, early, fetched, clock=self.now_s
-        )
+        try:
+            self.memory = memory = MapInMemory(
+                config, catalogue, self.directory, pins, "", 0o400, -1, early, fetched, clock=self.now_s
+            )
+        except BaseException:
+            if early is not None:
+                early[1].close()
+                early[0].wait(TIMEOUT_S)
+            raise
         self.cache, self.scheduler, self.sessions = memory.cache, memory.scheduler, memory.sessions
         self.statistics, self.event_log, self.watched = memory.statistics, memory.event_log, memory.watched
         self.map_switch, self.waiting = memory.map_switch, memory.waiting
