@@ -606,7 +606,7 @@ def test_a_database_that_is_shorter_or_no_database(tmp_path: Path, any_body: Non
         assert (list(found.unknown), found.good) == (["map.db.damaged.1"], False)
         with closing(Folder(tmp_path / name)) as folder:
             repair(folder, found)
-        assert checked(tmp_path / name).good, "until it is forgotten on purpose"
+        assert not checked(tmp_path / name).unknown, "until it is forgotten on purpose"
         with opened(tmp_path / name) as forgotten:
             assert forgotten.losses(9) == ((), 0)
 
