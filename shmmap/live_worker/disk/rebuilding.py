@@ -302,15 +302,15 @@ def rebuild(
         record = record or found.record
         if record is None:
             raise MapDataError(f"{reason}; so is the copy of its record", path=DATABASE)
-        lost = dict(record.lost_chunks)
+        lost = dict(record.lost)
         for key, version in (found.names if known is None else known).items():
             if key not in found.rows or found.rows[key][0].version < version:
-                lost[key] = Lost(version, reason)
-        record.lost = {key.text: one for key, one in lost.items()}
-        record.damaged = []
-        make_database(folder, record, _chunks(versions, found))
+                lost[key.text] = Lost(version, reason)
+        made = msgspec.structs.replace(record, lost=lost, damaged=[])
+        make_database(folder, made, _chunks(versions, found))
     aside = free_name(folder, DATABASE + DAMAGED)
     replace_database(folder, aside)
+    record.lost, record.damaged = lost, []  # until here all of it can be done again
     log.error(
         "database of a live map rebuilt", kept=aside, chunks=len(found.rows), lost=len(lost), reason=reason
     )
