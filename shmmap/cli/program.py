@@ -261,6 +261,16 @@ def complain(name: str, message: str, hint: str = "") -> None:
         print_line(f"hint: {hint}", file=sys.stderr)
 
 
+@contextlib.contextmanager
+def hint_if_interrupted(hint: str) -> Iterator[None]:
+    """Say on stderr how an interrupted run can be continued."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        complain("shmmap", "interrupted", hint)
+        raise
+
+
 def add_allow_empty(parser: argparse.ArgumentParser) -> None:
     """Add ``--allow-empty``."""
     parser.add_argument("--allow-empty", action="store_true", help="exit with 0 also when nothing is found")

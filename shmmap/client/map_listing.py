@@ -140,7 +140,7 @@ def list_cells(
                     session.welcome.id_prefix,
                     map_version=page.map_version,
                     since_known=page.since_known,
-                    removed=tuple(session.whole_id(cell) for cell in page.removed),
+                    removed=tuple(session.welcome.whole_id(cell) for cell in page.removed),
                 )
             elif page.map_version != listing.map_version:
                 break  # the map was reloaded in between: pages of two versions cannot be combined

@@ -396,10 +396,6 @@ class Session:
                 versions.clear()
         return reported
 
-    def whole_id(self, cell_id: str) -> str:
-        """Return the full cell id of an id that a reply contains."""
-        return _whole_id(cell_id, self.welcome)
-
     def _attach(self, handle: Handle, welcome: messages.Welcome, populate: bool) -> Cell:
         if (cell := self.attacher.attached(handle)) is not None:
             return cell
@@ -411,7 +407,7 @@ class Session:
             self._access_epoch = welcome.epoch
         return self.attacher.attach(
             handle,
-            _whole_id(handle.id, welcome),
+            welcome.whole_id(handle.id),
             welcome.segment_prefix + handle.segment,
             access,
             populate=populate,
@@ -470,21 +466,18 @@ class _ReplyCells:
             except StaleHandle:  # noqa: PERF203  one cell must not affect the others
                 self.gone.append((place, handle))
             except SegmentCorrupt as error:
-                cell_id = self._whole(handle.id)
+                cell_id = self.welcome.whole_id(handle.id)
                 message = f"{cell_id} ({handle.layer}): {error}"
                 box = (handle.min_x, handle.min_y, handle.max_x, handle.max_y)
                 failure = LoadFailed(message, cell_id=cell_id, layer=handle.layer, box=box)
                 failure.__cause__ = error
                 self._failed.append(failure)
-        whole = self._whole
+        whole = self.welcome.whole_id
         self._pending += [PendingLayer(whole(cell.id), cell.layer) for cell in reply.pending]
         self._failed += [
             cell_error(cell, cell.id if cell.code == "unknown_cell" else whole(cell.id))
             for cell in reply.failed
         ]
-
-    def _whole(self, cell_id: str) -> str:
-        return _whole_id(cell_id, self.welcome)
 
     def ask_again(self, deadline_s: float) -> Asked:
         """Return the request for the handles whose segments were gone before they could be attached."""
@@ -522,7 +515,8 @@ class _ReplyCells:
         removed: Callable[[Sequence[str], bytes], tuple[str, ...]] | None,
     ) -> CellSet:
         """Return the answer; cells whose segments are still gone count as pending."""
-        self._pending += [PendingLayer(self._whole(handle.id), handle.layer) for _, handle in self.gone]
+        whole = self.welcome.whole_id
+        self._pending += [PendingLayer(whole(handle.id), handle.layer) for _, handle in self.gone]
         return CellSet(
             tuple(map(self._cells.__getitem__, sorted(self._cells))),
             tuple(self._failed),
@@ -544,10 +538,6 @@ class _Countdown:
 
     def __call__(self) -> float | None:
         return None if self._end_s is None else max(0.0, self._end_s - time.monotonic())
-
-
-def _whole_id(cell_id: str, welcome: messages.Welcome) -> str:
-    return cell_id if cell_id.startswith("/") else welcome.id_prefix + cell_id
 
 
 TURNS.update(function.__code__ for function in (Session._take, Session._report_unmapped, Session._connected))

@@ -87,7 +87,7 @@ class Service:
         gid: int,
         signals: StartSignals,
         activated: ActivatedSocket | None,
-        lock: InstanceLock | None = None,
+        lock: InstanceLock,
         elsewhere: PublishedOrigin | None = None,
     ) -> None:
         self._config = config
@@ -290,7 +290,7 @@ class Service:
             log.warning("socket removed by another program, and made again", path=file.path)
             listener.move_to(again.socket)
             self._sockets[at] = again, listener
-        if self._lock is not None and not missing:
+        if not missing:
             self._lock.restore()
         self._memory.statistics.set("sockets_missing", missing)
 
@@ -301,7 +301,7 @@ class Service:
         self._memory.event_log.close()
         self._connections.deliver(LAST_WORDS_S)
         for file, _listener in self._sockets:
-            file.close()
+            file.socket.close()
         self._reloader.close()
         if self._file_watch is not None:
             self._file_watch.close()
@@ -417,8 +417,7 @@ class Service:
         take_away(directory, instance)
         for file, _listener in self._sockets:
             file.remove()
-        if self._lock is not None:
-            self._lock.release()
+        self._lock.release()
         os._exit(0)  # the loaders die with this process
 
 

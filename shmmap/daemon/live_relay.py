@@ -50,16 +50,15 @@ class LiveEvents:
 
     event_log: EventLog
     statistics: StatisticsWriter
-    _rows: dict[str, LiveMapRow] = field(default_factory=dict)
     _published: dict[str, LiveMapRow] = field(default_factory=dict)
     _adopted: int = 0
     _begun: bool = False
 
-    def begin(self, maps: int) -> None:
+    def begin(self, maps: int, rows: Sequence[LiveMapRow]) -> None:
         """Publish events from now on, beginning with the present state of ``maps`` (number of maps)."""
         self._begun = True
         self.started(maps, self._adopted)
-        self._publish_changes()
+        self.update(rows)
 
     def started(self, maps: int, adopted: int) -> None:
         """Report that the process serves ``maps`` maps, and found ``adopted`` chunks in memory."""
@@ -73,29 +72,21 @@ class LiveEvents:
         if self._begun:
             self.event_log.publish(events.LiveEnded, restarts)
 
-    def beat(self) -> None:
-        """Write the statistics while the daemon waits for live maps, and its loop does not run yet."""
-        self.statistics.beat()
-
     def update(self, rows: Sequence[LiveMapRow]) -> None:
-        """Report the present state of the maps."""
-        self._rows = {row.name: row for row in rows}
-        if self._begun:
-            self._publish_changes()
-
-    def _publish_changes(self) -> None:
-        """Publish the changes since the last publication."""
-        for name, row in self._rows.items():
-            before = self._published.get(name)
+        """Report the present state of the maps: publish the changes since the last publication."""
+        if not self._begun:
+            return
+        for row in rows:
+            before = self._published.get(row.name)
             known = before.damaged if before is not None else ()
             for what in row.damaged:
                 if what not in known:
-                    self.event_log.publish(events.LiveDamaged, name, what)
+                    self.event_log.publish(events.LiveDamaged, row.name, what)
             if _cause(row.problem) != _cause(before.problem if before is not None else ""):
-                self.event_log.publish(events.LiveProblem, name, row.problem)
+                self.event_log.publish(events.LiveProblem, row.name, row.problem)
             if before is not None and row.change != before.change:
-                self.event_log.mention(events.LiveChanged, name, row.change)
-        self._published = self._rows
+                self.event_log.mention(events.LiveChanged, row.name, row.change)
+        self._published = {row.name: row for row in rows}
 
 
 def _cause(problem: str) -> str:
@@ -197,7 +188,10 @@ class Tickets:
 
 
 class NoLiveMaps:
-    """Replacement for `LiveRelay` in a daemon without live maps."""
+    """Replacement for `LiveRelay` in a daemon without live maps: nothing is ever due, or unsaved."""
+
+    next_s: Final = math.inf
+    unsaved: Final[dict[str, int]] = {}
 
     def begin_events(self) -> None:
         """Do nothing."""
@@ -219,21 +213,11 @@ class NoLiveMaps:
     def beat(self, now_s: float) -> None:
         """Do nothing."""
 
-    @property
-    def next_s(self) -> float:
-        """Infinity: nothing is ever due."""
-        return math.inf
-
     def run_step(self, now_s: float) -> None:
         """Do nothing."""
 
     def close(self, *, keep: bool) -> None:
         """Do nothing."""
-
-    @property
-    def unsaved(self) -> dict[str, int]:
-        """Empty: nothing is unsaved."""
-        return {}
 
 
 class LiveRelay:
@@ -327,7 +311,7 @@ class LiveRelay:
                 self.start()
             self._wait(min(left_s, BEAT_S))
             self.on_readable()
-            self._events.beat()
+            self._events.statistics.beat()  # the daemon's loop does not run yet
         if alone and self._refused is not None:
             raise self._refused
         if not self._serving:
@@ -343,7 +327,7 @@ class LiveRelay:
 
     def begin_events(self) -> None:
         """Emit events from now on: clients are served."""
-        self._events.begin(len(self._begin.maps))
+        self._events.begin(len(self._begin.maps), self._rows)
 
     def _wait(self, seconds: float) -> None:
         """Wait until the worker's channel is readable, or writable if messages are queued."""
@@ -543,13 +527,8 @@ class LiveRelay:
 
     def _start_to_save(self, end_s: float) -> None:
         """Start a new worker, which takes over the chunks that the last one left in memory."""
-        if self._channel is None:
-            try:
-                self.start()
-            except Replaced:
-                log.error("live worker not started", reason=RESTART)
-            except OSError as error:
-                log.error("live worker not started", reason=error.strerror)
+        self._start_s = 0.0
+        self.beat(time.monotonic())
         while self._channel is not None and not self._serving and (left_s := end_s - time.monotonic()) > 0:
             self._wait(left_s)
             self.on_readable()

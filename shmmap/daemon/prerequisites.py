@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import ctypes
 import grp
-import importlib
 import os
 import pwd
 import resource
@@ -41,7 +40,7 @@ def give_back_large_tables() -> None:
 
 def import_ahead() -> None:
     """Import modules that numpy imports at the first `np.unique`, which takes 12 ms, before the loop runs."""
-    importlib.import_module("numpy.ma")
+    import numpy.ma  # noqa: F401
 
 
 def access_of_segments(config: DaemonConfig) -> tuple[int, int]:

@@ -106,7 +106,8 @@ def check_versions(diagnosis: Diagnosis) -> Finding:
     if not served:
         return ok(offer) if offered else skip(f"{offer}; no daemon says what it serves")
     taken_s = counters["published_taken_unix_ns"] * 1e-9
-    fact = f"version {served}{_published(answer.served_created_s)} is served, taken {_ago(taken_s)}"
+    ago = format_duration(max(time.time() - taken_s, 0.0))
+    fact = f"version {served}{_published(answer.served_created_s)} is served, taken {ago} ago"
     refused, advice = refused_offer(counters)
     if refused:
         return warn(f"{fact}; {refused}", advice)
@@ -145,7 +146,3 @@ def _published(created_s: float | None) -> str:
     if created_s is None:
         return ""
     return f" of {datetime.datetime.fromtimestamp(created_s, datetime.timezone.utc):%Y-%m-%d}"
-
-
-def _ago(moment_s: float) -> str:
-    return f"{format_duration(max(time.time() - moment_s, 0.0))} ago"

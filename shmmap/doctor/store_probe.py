@@ -74,8 +74,6 @@ class StoreAnswer(msgspec.Struct):
     served_created_s: float | None = None
     clock_s: float | None = None
     """Seconds by which the store's clock is ahead of this machine's."""
-    is_late: bool = False
-    """Whether the process was killed because it took too long."""
 
 
 def ask_store(question: StoreQuestion, environment: Mapping[str, str] | None) -> StoreAnswer:
@@ -112,7 +110,6 @@ def ask_store(question: StoreQuestion, environment: Mapping[str, str] | None) ->
         said, _ = process.communicate()
     lines = said.splitlines()
     answer = msgspec.json.decode(lines[-1], type=StoreAnswer) if lines else StoreAnswer()
-    answer.is_late = is_late
     if not is_late and process.returncode and not answer.error:
         answer.error = f"the process that asks it ended with {process.returncode}"
     return answer

@@ -25,7 +25,6 @@ from shmmap.formats.point_checks import PointChecks
 from shmmap.formats.source_file import FileReader, refusal
 from shmmap.formats.text_rows import RowParser
 
-_FIRST_READ_BYTES: Final = 4096  # long enough for nearly every header
 _WALK_BYTES: Final = 1 << 20
 _SHOWN_NAME: Final = 60
 _HEADER_END: Final = re.compile(rb"[\r\n]end_header[ \t]*\r?[\r\n].", re.DOTALL)
@@ -77,11 +76,8 @@ class PlyReader(FileReader):
         self._record = record.newbyteorder(">") if self.encoding == "binary_big_endian" else record
 
     def _read_header(self) -> None:
-        size = self._source.size
-        head = self._source.peek(min(size, _FIRST_READ_BYTES))
-        if len(head) < size and not _HEADER_END.search(head):
-            head = self._source.peek(min(size, HEADER_LIMIT_BYTES))
-        self._header: PlyHeader = parse_ply_header(head, path=self.path, file_bytes=size)
+        head = self._source.head(_HEADER_END, HEADER_LIMIT_BYTES)
+        self._header: PlyHeader = parse_ply_header(head, path=self.path, file_bytes=self._source.size)
 
     @property
     def warnings(self) -> tuple[str, ...]:

@@ -8,6 +8,7 @@ programs, the messages are for people.
 from __future__ import annotations
 
 import os
+import re
 import stat
 from types import TracebackType
 from typing import Any, Final, NoReturn, TypeVar
@@ -21,6 +22,7 @@ from shmmap.errors import MapDataError
 _Self = TypeVar("_Self", bound="FileReader")
 
 _LFS: Final = b"version https://git-lfs"
+_FIRST_READ_BYTES: Final = 4096  # long enough for nearly every header
 
 
 def open_regular(path: str) -> int:
@@ -118,6 +120,11 @@ class SourceFile:
             return os.pread(self._fd, count, 0)
         except OSError as error:
             self._unreadable(error, self.at)
+
+    def head(self, end: re.Pattern[bytes], most: int) -> bytes:
+        """Return the start of the file as `peek` does: some bytes, or ``most`` where these lack ``end``."""
+        head = self.peek(_FIRST_READ_BYTES)
+        return head if len(head) >= self.size or end.search(head) else self.peek(most)
 
     def start(self, head: bytes) -> None:
         """Digest ``head``, the first bytes of the file, and continue after them."""

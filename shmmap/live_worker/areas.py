@@ -57,10 +57,8 @@ def touches(area: LiveArea | None, key: ChunkKey, resolution: float) -> bool:
     )
 
 
-def inside(area: LiveArea | None, centers: NDArray[np.float64]) -> NDArray[np.bool_]:
+def inside(area: LiveArea, centers: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return which places, (N, 3) metres, lie in an area, (N,)."""
-    if area is None:
-        return np.ones(len(centers), np.bool_)
     found: NDArray[np.bool_]
     if isinstance(area, SphereMessage):
         away = centers - np.array([area.x, area.y, area.z])

@@ -78,11 +78,6 @@ def view_at(address: int, size: int) -> ChunkView:
     return ChunkView((ctypes.c_char * size).from_address(address))
 
 
-def unmap_chunk(address: int) -> None:
-    """Unmap a chunk: no view of it may be used any more."""
-    _libc.munmap(address, MAX_BYTES)
-
-
 @dataclass(eq=False)
 class ChunkFile:
     """One chunk in memory, mapped for writing.
@@ -125,7 +120,7 @@ class ChunkFile:
     def unmap(self) -> int:
         """Unmap the chunk, after which ``view`` must not be used; return its descriptor."""
         self.view = ChunkView(bytearray(HEADER_BYTES))
-        unmap_chunk(self._address)
+        _libc.munmap(self._address, MAX_BYTES)
         return self._fd
 
     def close(self) -> None:

@@ -156,7 +156,7 @@ class _Worker:
         self._budget_bytes = wanted.budget_bytes // max(1, len(wanted.maps))  # of each map
         self._opening = {one.name: _OpeningMap(one, self._budget_bytes, self._wake) for one in wanted.maps}
         self._maps: dict[str, ServedMap] = {}
-        self._closing: dict[str, contextlib.ExitStack] = {}
+        self._closing = contextlib.ExitStack()  # of all maps, and of the marks
         self._ending: messages.End | None = None
         self._ending_s = self._status_s = 0.0
         self._reported: messages.Status | None = None
@@ -199,6 +199,7 @@ class _Worker:
             closing.callback(database.close, END_S)
             if self._marks is None:
                 self._marks = MarksDirectory(wanted.marks_dir, wanted.marks_gid)
+                self._closing.callback(self._marks.close)
             memory = ChunkMemory(wanted.shm_dir, prefix, wanted.gid)
             closing.callback(memory.close)
             served = ServedMap(
@@ -206,7 +207,7 @@ class _Worker:
             )
             closing.callback(served.paged.close)
             adopted = served.adopt(time.monotonic())
-            self._closing[settings.name] = closing.pop_all()
+            self._closing.push(closing.pop_all())
         log.info(
             "live map in memory",
             map=settings.name,
@@ -214,7 +215,7 @@ class _Worker:
             chunks=adopted,
             files=len(database.rows),
             damaged=len(database.damaged),
-            lost=len(database.lost),
+            lost=len(database.record.lost),
         )
         return served
 
@@ -344,10 +345,7 @@ class _Worker:
         for name, one in self._maps.items():
             if chunks := one.end(keep=ending.keep):
                 unsaved.append(messages.Unsaved(name, chunks, one.paged.problem))
-        if self._marks is not None:
-            self._marks.close()
-        for closing in self._closing.values():
-            closing.close()
+        self._closing.close()
         return tuple(unsaved)
 
 

@@ -186,7 +186,8 @@ class PagedMap:
         self.database = database
         self.memory = memory
         self.limits = limits
-        self.residency = Residency(limits, new_bytes=memory_bytes(0))
+        sizes = {key: memory_bytes(row.bricks) for key, row in database.rows.items()}
+        self.residency = Residency(limits, new_bytes=memory_bytes(0), sizes=sizes)
         self.chunks: dict[ChunkKey, ChunkFile] = {}
         self.stored = KeyIndex(database.rows)
         self.problems: dict[str, str] = {}
@@ -201,8 +202,6 @@ class PagedMap:
         self._generation = database.record.runs << 32
         self._look_s = 0.0
         self._end_s: float | None = None
-        for key, row in database.rows.items():
-            self.residency.note_size(key, memory_bytes(row.bricks))
 
     @property
     def resolution(self) -> float:

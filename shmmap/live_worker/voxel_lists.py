@@ -286,7 +286,8 @@ class VoxelLists:
 def lacking_chunks(paged: PagedMap, area: LiveArea | None) -> Generator[None, None, dict[ChunkKey, str]]:
     """Return the chunks that touch an area and have lost something, and what; yield after each step."""
     found: dict[ChunkKey, str] = {}
-    for number, (key, one) in enumerate(dict(paged.database.lost).items(), 1):
+    for number, (text, one) in enumerate(dict(paged.database.record.lost).items(), 1):
+        key = ChunkKey.from_text(text)
         if touches(area, key, paged.resolution):
             found[key] = one.text
         if number % LOST_PER_STEP == 0:

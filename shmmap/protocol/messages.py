@@ -275,6 +275,10 @@ class Welcome(Message, tag="welcome"):
     crs: str = ""
     unit_m: tuple[float, float] = (1.0, 1.0)
 
+    def whole_id(self, cell_id: str) -> str:
+        """Return the full id of a cell, given its id in a reply."""
+        return cell_id if cell_id.startswith("/") else self.id_prefix + cell_id
+
 
 class Handle(msgspec.Struct, array_like=True, frozen=True, gc=False):
     """Location of one layer of one cell in shared memory.

@@ -121,7 +121,7 @@ class PointImage:
         self._crop = crop
         self.ground: GroundGrid | None = None
         if with_ground:
-            self.ground = GroundGrid(_ground_box(camera) if crop is None else _tuple(crop))
+            self.ground = GroundGrid(_ground_box(camera) if crop is None else crop.bounds)
 
     def add(
         self, xyz: NDArray[Any], origin: Vector = (0.0, 0.0, 0.0), values: NDArray[Any] | None = None
@@ -272,10 +272,6 @@ def _spacing(filled: NDArray[np.bool_]) -> float:
     sums = np.pad(filled, (side // 2 + 1, side // 2)).astype(np.int32).cumsum(axis=0).cumsum(axis=1)
     counts = sums[side:, side:] - sums[:-side, side:] - sums[side:, :-side] + sums[:-side, :-side]
     return side / math.sqrt(float(np.percentile(counts[filled], _SPARSE)))
-
-
-def _tuple(box: Box) -> tuple[float, float, float, float]:
-    return box.min_x, box.min_y, box.max_x, box.max_y
 
 
 def _ground_box(camera: Camera) -> tuple[float, float, float, float]:

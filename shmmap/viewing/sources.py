@@ -276,6 +276,12 @@ class _LiveFiles(PointSource):
             yield Points(columns["xyz"], _NO_ORIGIN, values_of(columns, column, len(places), "a live map"))
 
 
+def _range_of(heights: NDArray[np.float64]) -> HeightRange | None:
+    """Return the heights of all cells, given those of each, (N, 2); None if none is known."""
+    known = heights[np.isfinite(heights).all(axis=1)]
+    return (float(known[:, 0].min()), float(known[:, 1].max())) if len(known) else None
+
+
 class _PublishedMap(PointSource):
     """The points of a published map, whose objects are fetched and verified."""
 
@@ -287,21 +293,15 @@ class _PublishedMap(PointSource):
         super().__init__(f"{store.url}, version {current.version}")
         pages = KeptObjects(store, None, is_index=True, keep=False)
         self._objects = KeptObjects(store, None, keep=False)
-        self._shards = list(read_shards(pages, read_root(pages, current)))
+        self._root = read_root(pages, current)
+        self._shards = list(read_shards(pages, self._root))
 
     def extent(self) -> BoxTuple | None:
-        boxes = [shard.boxes for shard in self._shards if len(shard.boxes)]
-        if not boxes:
-            return None
-        low = np.min([box[:, :2].min(axis=0) for box in boxes], axis=0)
-        high = np.max([box[:, 2:].max(axis=0) for box in boxes], axis=0)
-        return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+        return self._root.bounds
 
     def heights(self, area: Box) -> HeightRange | None:
         z = [shard.z[area.overlaps(shard.boxes)] for shard in self._shards]
-        known = np.concatenate([*z, np.empty((0, 2))])
-        known = known[np.isfinite(known).all(axis=1)]
-        return (float(known[:, 0].min()), float(known[:, 1].max())) if len(known) else None
+        return _range_of(np.concatenate([*z, np.empty((0, 2))]))
 
     def blocks(self, area: Box, column: str) -> Iterator[Points]:
         from shmmap.origin.remote.published_object import POINTS, read_bare_header, rows_of
@@ -415,9 +415,7 @@ class _ServedCells(PointSource):
         known = [one.z_bounds for one in self.cells(area)]
         if None in known:
             known = [cell.z_bounds for cell in self._attached(area)]
-        z = np.array([one for one in known if one is not None]).reshape(-1, 2)
-        z = z[np.isfinite(z).all(axis=1)]
-        return (float(z[:, 0].min()), float(z[:, 1].max())) if len(z) else None
+        return _range_of(np.array([one for one in known if one is not None]).reshape(-1, 2))
 
     def blocks(self, area: Box, column: str) -> Iterator[Points]:
         self.parts = 0

@@ -93,7 +93,7 @@ class Disk:
         (found / "map.db-wal").write_bytes(log)
         (found / "map.json").write_bytes(self.read("map.json").replace(boot_id().encode(), b"before"))
         with closing(Folder(found)) as folder, closing(MapDatabase(folder, SETTINGS)) as again:
-            assert (again.lost, again.damaged) == ({}, {})
+            assert (again.record.lost_chunks, again.damaged) == ({}, {})
             assert again.map_id == self.database.map_id
             for key, version in self.durable.items():
                 assert again.version(key) >= version

@@ -176,7 +176,7 @@ class CellCache:
                 resident = None
         if resident is None and self.ledger.retired:
             key = self.key(index, layer)
-            if self.reclaimer.may_revive(key):
+            if self.reclaimer.retired_of(key) is not None:
                 resident = self.reclaimer.revive(key, self.layers.version(index, layer), now_s)
             if resident is not None:
                 self._enter(resident, index)

@@ -127,14 +127,9 @@ class MapSwitch:
         self._unseen, self._cache.unentered = Walk(segments), count
 
     @property
-    def busy(self) -> bool:
-        """Whether `run_step` has something to do."""
-        return self._unseen is not None or self._to_free is not None
-
-    @property
     def next_s(self) -> float:
         """When `run_step` has something to do: at once, or never."""
-        return 0.0 if self.busy else math.inf
+        return math.inf if self._unseen is None and self._to_free is None else 0.0
 
     def run_step(self, now_s: float) -> None:
         """Free some unused tables, or check some segments.

@@ -227,13 +227,9 @@ class Reclaimer:
         heapq.heappush(self.due, (when_s, self._number, retired))
 
     def retired_of(self, key: Key) -> Resident | None:
-        """Return the segment of a key that was retired last, while it exists."""
+        """Return the segment of a key that was retired last, while it exists; it may be revived."""
         retired = self._by_key.get(key)
         return retired.resident if retired is not None else None
-
-    def may_revive(self, key: Key) -> bool:
-        """Whether a retired segment could be handed out again if its version is the current one."""
-        return key in self._by_key
 
     def revive(self, key: Key, version: int, now_s: float) -> Resident | None:
         """Put a retired segment of exactly this version back into service if it still exists."""

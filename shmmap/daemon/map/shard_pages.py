@@ -215,7 +215,7 @@ class ShardPages:
         self.fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         weakref.finalize(self, os.close, self.fd)  # when no weak reference reaches these pages any more
         for number, shard in known.items():
-            page = self._page(number, shard)
+            page = Page.of(number, shard, self._first[number])
             names = _shared_out(page)
             if (twice := self._known_name(names)) is not None:
                 raise MapDataError(f"two cells are called {root.id_prefix}{twice}", cause=DAMAGED)
@@ -333,7 +333,7 @@ class ShardPages:
 
     def deliver(self, number: int, shard: Shard | None) -> None:
         """Queue an arrived shard; None: it cannot be fetched at present.  Called in a thread."""
-        page = self._page(number, shard) if shard is not None else None
+        page = Page.of(number, shard, self._first[number]) if shard is not None else None
         self._arrived.append((number, page, _shared_out(page) if page is not None else []))
         os.eventfd_write(self.fd, 1)
 
@@ -405,9 +405,6 @@ class ShardPages:
                     self._by_base[base] = left
                 else:
                     del self._by_base[base]
-
-    def _page(self, number: int, shard: Shard) -> Page:
-        return Page.of(number, shard, self._first[number])
 
     def _known_name(self, names: list[dict[bytes, int]]) -> str | None:
         """Return one of these names that a page in memory has."""

@@ -11,7 +11,7 @@ import contextlib
 import time
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
+from collections.abc import Callable, Iterator, Mapping, Sized
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
@@ -45,38 +45,29 @@ SAMPLE_S: Final = 1.0
 
 
 class RecentCounts:
-    """Values of some counters, sampled once a second, to compute their recent growth.
+    """Values of the counters `WINDOWED`, sampled once a second, to compute their growth over `SPANS`."""
 
-    Parameters
-    ----------
-    names
-        Names of the counters.
-    spans_s
-        Time spans over which growth is computed, longest last.
-    """
-
-    def __init__(self, names: Iterable[str], spans_s: Iterable[float]) -> None:
-        self._names = tuple(names)
-        self._spans_s = tuple(spans_s)
-        length = int(max(self._spans_s) / SAMPLE_S) + 2
-        self._samples: deque[tuple[float, tuple[int, ...]]] = deque(maxlen=length)
+    def __init__(self) -> None:
+        length = int(max(SPANS.values()) / SAMPLE_S) + 2
+        self._samples: deque[tuple[float, dict[str, int]]] = deque(maxlen=length)
 
     def look(self, values: Mapping[str, int], now_s: float) -> None:
         """Take a sample if the last one is old enough."""
         if not self._samples or now_s - self._samples[-1][0] >= SAMPLE_S:
-            self._samples.append((now_s, tuple(values[name] for name in self._names)))
+            self._samples.append((now_s, {name: values[name] for name in WINDOWED}))
 
-    def growth(self, values: Mapping[str, int], now_s: float) -> list[tuple[int, ...]]:
-        """Return the growth of each counter per span, to a sample's precision.
+    def growth(self, values: Mapping[str, int], now_s: float) -> dict[str, int]:
+        """Return the growth of each counter over each span, to a sample's precision, by gauge.
 
-        If a span is longer than the stored samples, the growth since the first sample is returned.
+        If a span is longer than the stored samples, the growth is that since the first sample.
         """
-        return [
-            tuple(values[name] - old for name, old in zip(self._names, self._at(now_s - span), strict=True))
-            for span in self._spans_s
-        ]
+        return {
+            f"{name}_{span}": values[name] - old
+            for span, seconds in SPANS.items()
+            for name, old in self._at(now_s - seconds).items()
+        }
 
-    def _at(self, time_s: float) -> tuple[int, ...]:
+    def _at(self, time_s: float) -> dict[str, int]:
         """Return the newest sample that is at least as old as ``time_s``, or else the oldest one."""
         found = bisect_right(self._samples, time_s, key=lambda sample: sample[0])
         return self._samples[max(0, found - 1)][1]
@@ -140,7 +131,7 @@ class Sampler:
     _awake_s: float = 0.0  # of the last beat before which something had arrived
     _idle: bool = False
     _beating: Iterator[None] | None = None
-    _recent: RecentCounts = field(default_factory=lambda: RecentCounts(WINDOWED, SPANS.values()))
+    _recent: RecentCounts = field(default_factory=RecentCounts)
     _event_beat_s: float = float("-inf")
     _last_s: float = 0.0
     _outage_since_s: float | None = None
@@ -188,9 +179,7 @@ class Sampler:
         """Sample the counters, and publish periodic reports and events."""
         values = self.statistics.values
         self._recent.look(values, now_s)
-        for span, growth in zip(SPANS, self._recent.growth(values, now_s), strict=True):
-            for name, count in zip(WINDOWED, growth, strict=True):
-                values[f"{name}_{span}"] = count
+        values.update(self._recent.growth(values, now_s))
         self.cache.report(now_s)
         self._measure_prefetching(now_s)
         if now_s - self._event_beat_s >= EVENT_BEAT_S:

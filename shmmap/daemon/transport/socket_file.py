@@ -61,10 +61,6 @@ class SocketFile:
             with contextlib.suppress(OSError):
                 os.unlink(self.path)
 
-    def close(self) -> None:
-        """Stop listening."""
-        self.socket.close()
-
 
 def refuse_taken(path: str) -> bool:
     """Check whether a socket may be created at ``path``; return True to replace a stale one of this user.

@@ -32,7 +32,6 @@ from shmmap.formats.source_file import FileReader, refusal
 
 Block = tuple[NDArray[Any], ...]
 
-_FIRST_READ_BYTES: Final = 2048  # long enough for nearly every header
 _DATA_LINE: Final = re.compile(rb"^[ \t]*DATA(?=\s)[^\n]*\n", re.MULTILINE | re.IGNORECASE)
 _TAIL_READ_BYTES: Final = 1 << 18
 
@@ -85,11 +84,8 @@ class PcdReader(FileReader):
         self.digest = b""
 
     def _read_header(self) -> None:
-        size = self._source.size
-        head = self._source.peek(min(size, _FIRST_READ_BYTES))
-        if len(head) < size and not _DATA_LINE.search(head):
-            head = self._source.peek(min(size, HEADER_LIMIT_BYTES))
-        self.header: PcdHeader = parse_header(head, path=self.path, file_bytes=size)
+        head = self._source.head(_DATA_LINE, HEADER_LIMIT_BYTES)
+        self.header: PcdHeader = parse_header(head, path=self.path, file_bytes=self._source.size)
         self._head = head[: self.header.data_offset]
 
     @property

@@ -90,9 +90,6 @@ class MapDatabase:
     ----------
     rows : dict
         The chunks on disk.
-    lost : dict
-        Chunks of which something that was saved is lost.  They stay here, and in the record, when the chunk
-        is mapped again, until ``shmmap live fsck --repair`` forgets them.
     found_lost : collections.deque
         Chunks whose saved bytes were lost since this was last emptied.
     damaged : dict
@@ -100,9 +97,10 @@ class MapDatabase:
     unreadable : dict
         Chunks that cannot be read from the disk at present, and why.
     record : MapRecord
-        Everything about the map but its chunks.
+        Everything about the map but its chunks.  Chunks that lost something stay in it when they are mapped
+        again, until ``shmmap live fsck --repair`` forgets them.
     record_is_due : bool
-        Whether `lost` has changed since the record was last written.
+        Whether the lost chunks have changed since the record was last written.
 
     Raises
     ------
@@ -117,7 +115,6 @@ class MapDatabase:
     def __init__(self, folder: Folder, settings: MapSettings) -> None:
         self.folder = folder
         self.rows: dict[ChunkKey, Row] = {}
-        self.lost: dict[ChunkKey, Lost] = {}
         self.found_lost: deque[ChunkKey] = deque()
         self.damaged: dict[str, str] = {}
         self.unreadable: dict[ChunkKey, str] = {}
@@ -184,7 +181,6 @@ class MapDatabase:
             undo.pop_all()
         with self._changing:
             self.rows, self._numbers, self._next_number = rows, numbers, last + 1
-            self.lost = self.record.lost_chunks
             self.damaged = {**self.record.unknown, **self.damaged}
             self._opened += 1
 
@@ -203,20 +199,18 @@ class MapDatabase:
         self._damage = reason  # until that has succeeded nothing else is done
         with self._reading:
             self._disconnect()
-            before, lost = dict(self.rows), dict(self.lost)
-            if self._has_record:
-                self.record.lost = {key.text: one for key, one in lost.items()}
             record = self.record if self._has_record else _copy_of_record(self.folder)
-            known = {key: row.version for key, row in before.items()} if self._opened else None
+            known = {key: row.version for key, row in self.rows.items()} if self._opened else None
+            before = record.lost if record is not None else {}
             self.record, aside = rebuild(self.folder, record, known, reason)
             self._has_record = True
             self._damage = ""
             self.damaged[aside] = reason
             self.record_is_due = True
-            for key, one in self.record.lost_chunks.items():
-                if lost.get(key) != one:
-                    self.found_lost.append(key)
-                    log.error("chunk lost", chunk=key.text, reason=reason)
+            for text, one in self.record.lost.items():
+                if before.get(text) != one:
+                    self.found_lost.append(ChunkKey.from_text(text))
+                    log.error("chunk lost", chunk=text, reason=reason)
             self._open()
 
     def close(self, seconds: float | None = None) -> None:
@@ -283,8 +277,7 @@ class MapDatabase:
 
         def put(writer: sqlite3.Connection) -> bytes:
             with self._changing:
-                self.record.lost = {key.text: one for key, one in self.lost.items()}
-            text = msgspec.json.encode(self.record)
+                text = msgspec.json.encode(self.record)
             writer.execute("replace into map values(0, ?)", (text.decode(),))
             return text
 
@@ -381,7 +374,7 @@ class MapDatabase:
                 return  # saved meanwhile
             del self.rows[key]
             self.record.damaged.append(self._numbers.pop(key))
-            self.lost.setdefault(key, Lost(row.version, why))
+            self.record.lost.setdefault(key.text, Lost(row.version, why))
             self.found_lost.append(key)
             self.record_is_due = True
         log.error("chunk lost", chunk=key.text, version=row.version, reason=why)
@@ -391,26 +384,26 @@ class MapDatabase:
     def note_remade(self, key: ChunkKey) -> None:
         """Note that a chunk is in memory without what was saved, if that is lost."""
         with self._changing:
-            one = self.lost.get(key)
+            one = self.record.lost.get(key.text)
             if one is not None and not one.remade:
-                self.lost[key] = msgspec.structs.replace(one, remade=True)
+                self.record.lost[key.text] = msgspec.structs.replace(one, remade=True)
                 self.record_is_due = True
 
     def note_whole(self, key: ChunkKey, version: int) -> None:
         """Note that a chunk is in memory as it was saved, or newer; it is lost no more if it is whole."""
         with self._changing:
-            one = self.lost.get(key)
+            one = self.record.lost.get(key.text)
             if one is None or one.remade or version < one.version:
                 return
-            del self.lost[key]
+            del self.record.lost[key.text]
             self.record_is_due = True
         log.info("chunk is whole in memory, and saved again", chunk=key.text)
 
     def losses(self, most: int) -> tuple[tuple[str, ...], int]:
         """Return texts about lost chunks and damaged databases; and their number."""
-        damaged, lost = dict(self.damaged), dict(self.lost)  # other threads find more
+        damaged, lost = dict(self.damaged), dict(self.record.lost)  # other threads find more
         texts = chain(
-            (f"{key.text}: {one.text}: {one.reason}" for key, one in lost.items()),
+            (f"{key}: {one.text}: {one.reason}" for key, one in lost.items()),
             (f"{name}: {why}" for name, why in damaged.items()),
         )
         return tuple(islice(texts, most)), len(lost) + len(damaged)
@@ -430,7 +423,7 @@ class MapDatabase:
                 self._next_number = max(self._next_number, number + 1)
 
         with self._writing:
-            if self.record_is_due and key in self.lost:
+            if self.record_is_due and key.text in self.record.lost:
                 self._write_map()  # else the damaged row would count at the next start
             if self._log_bytes() > MAX_LOG_BYTES:
                 self.bring_log_in()

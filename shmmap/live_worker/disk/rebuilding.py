@@ -303,17 +303,17 @@ def rebuild(
         record = record or found.record
         if record is None:
             raise MapDataError(f"{reason}; so is the copy of its record", path=DATABASE)
-        lost = dict(record.lost_chunks)
+        lost = dict(record.lost)
         for key, version in (found.names if known is None else known).items():
             if key not in found.rows or found.rows[key][0].version < version:
-                lost[key] = Lost(version, reason)
-        record.lost = {key.text: one for key, one in lost.items()}
-        record.damaged = []
-        aside = free_name(folder, DATABASE + DAMAGED)
+                lost[key.text] = Lost(version, reason)
+        aside, unknown = free_name(folder, DATABASE + DAMAGED), dict(record.unknown)
         if known is None and versions[-1].is_cut:
-            record.unknown[aside] = reason
-        make_database(folder, record, _chunks(versions, found))
+            unknown[aside] = reason
+        made = msgspec.structs.replace(record, lost=lost, unknown=unknown, damaged=[])
+        make_database(folder, made, _chunks(versions, found))
     replace_database(folder, aside)
+    record.lost, record.unknown, record.damaged = lost, unknown, []  # until here all of it can be done again
     log.error(
         "database of a live map rebuilt", kept=aside, chunks=len(found.rows), lost=len(lost), reason=reason
     )

@@ -18,8 +18,10 @@ from __future__ import annotations
 import enum
 import math
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import islice, takewhile
+from types import MappingProxyType
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -142,6 +144,8 @@ class Residency:
         Limits of the map.
     new_bytes
         Memory of an empty chunk.
+    sizes
+        Memory that each chunk on disk will use.
 
     Attributes
     ----------
@@ -155,7 +159,9 @@ class Residency:
         Known voxels in memory.
     """
 
-    def __init__(self, limits: Limits, *, new_bytes: int = 4096) -> None:
+    def __init__(
+        self, limits: Limits, *, new_bytes: int = 4096, sizes: Mapping[ChunkKey, int] = MappingProxyType({})
+    ) -> None:
         self.limits = limits
         self.chunks: dict[ChunkKey, Chunk] = {}
         self.index = KeyIndex()
@@ -165,7 +171,7 @@ class Residency:
         self._held = 0  # number of chunks that occupy memory
         self._new_bytes = new_bytes
         self._save_after_s = max(0.0, limits.checkpoint_s - TOGETHER_S)  # the rest is for the flush
-        self._sizes: dict[ChunkKey, int] = {}
+        self._sizes = dict(sizes)
         self.windows = Windows(limits.radius, limits.hysteresis)
         self._missing = _Missing(limits.radius)
         self._needing: dict[ChunkKey, Chunk] = {}
@@ -308,10 +314,6 @@ class Residency:
         if version > saved:
             self._soil(chunk, now_s)
         return chunk
-
-    def note_size(self, key: ChunkKey, nbytes: int) -> None:
-        """Record how much memory a chunk on disk will use."""
-        self._sizes[key] = nbytes
 
     def _size(self, key: ChunkKey) -> int:
         return self._sizes.get(key, self._new_bytes)

@@ -15,6 +15,7 @@ import zmq
 
 from shmmap.daemon.assembly import Service
 from shmmap.daemon.config import DaemonConfig
+from shmmap.daemon.host.instance import InstanceLock, lock_path
 from shmmap.daemon.host.scheduling import take_slices
 from shmmap.daemon.host.signals import StartSignals
 from shmmap.daemon.live_relay import NoLiveMaps
@@ -64,8 +65,9 @@ class WholeDaemon:
         self.memory = MapInMemory(config, catalogue, directory, pins, path, 0o400, -1, early)
         signals = cast("StartSignals", SimpleNamespace(keep=False, reload_wanted=False))
         reloader = Reloader(origin, lambda: self.memory.cache.catalogue)
+        self._lock = InstanceLock(lock_path(path))
         self.service = Service(
-            config, self.memory, NoLiveMaps(), reloader, ServiceManager(), path, -1, signals, activated=None
+            config, self.memory, NoLiveMaps(), reloader, ServiceManager(), path, -1, signals, None, self._lock
         )
         self.service._listen()
         self._context: zmq.Context[Any] = zmq.Context()
@@ -127,4 +129,5 @@ class WholeDaemon:
         self._context.term()
         self.service._end()
         self.memory.close(keep=keep)
+        self._lock.release()
         take_slices(0)  # the loop's short turns are not for the tests that follow

@@ -49,7 +49,7 @@ def test_all_well(ward: Ward) -> None:
 @pytest.mark.parametrize(
     ("answer", "row", "state", "says"),
     [
-        ({"credentials": "x", "is_late": True}, "link", "warn", "no answer within 12 s"),
+        ({"credentials": "x"}, "link", "warn", "no answer within 12 s"),
         ({"error": f"{URL}/CURRENT: no answer"}, "link", "warn", "no answer; the daemon reached it when"),
         ({"credentials_error": "half a pair"}, "credentials", "warn", "can be seen with sudo"),
         ({"credentials_error": "half a pair"}, "link", "skip", "see credentials"),

@@ -16,7 +16,7 @@ from shmmap.cli.options import (
     numbers,
     size_bytes,
 )
-from shmmap.cli.program import complain
+from shmmap.cli.program import hint_if_interrupted
 from shmmap.cli.screens.output import counted, format_bytes
 from shmmap.cli.screens.work_progress import StageProgress, fields_text, print_result
 
@@ -140,11 +140,8 @@ def run_divide(args: argparse.Namespace) -> int:
         check=args.check,
     )
     began_s = time.monotonic()
-    try:
+    with hint_if_interrupted("the same command with --resume continues"):
         made = divide(args.inputs, args.out, settings, progress=StageProgress(quiet=args.quiet))
-    except KeyboardInterrupt:
-        complain("shmmap", "interrupted", "the same command with --resume continues")
-        raise
     seconds = time.monotonic() - began_s
     print_result(made, _divided_lines(made, checked=args.check), seconds=seconds, as_json=args.json)
     return 0

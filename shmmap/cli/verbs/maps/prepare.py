@@ -18,7 +18,7 @@ from shmmap.cli.options import (
     add_verb,
     size_bytes,
 )
-from shmmap.cli.program import complain
+from shmmap.cli.program import hint_if_interrupted
 from shmmap.cli.screens.output import (
     counted,
     format_bytes,
@@ -190,7 +190,7 @@ def _prepare_slice(args: argparse.Namespace) -> int:
     number, slices = args.shards
     began_s = time.monotonic()
     verified = verified_at(store, args)
-    try:
+    with hint_if_interrupted("the same command continues"):
         done = prepare_slice(
             store,
             args.layer,
@@ -207,9 +207,6 @@ def _prepare_slice(args: argparse.Namespace) -> int:
             workers=worker_count(args),
             progress=progress_on_stderr(args),
         )
-    except KeyboardInterrupt:
-        complain("shmmap", "interrupted", "the same command continues")
-        raise
     return _report_slice(args, store.url, done, time.monotonic() - began_s)
 
 

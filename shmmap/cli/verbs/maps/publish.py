@@ -18,7 +18,7 @@ from shmmap.cli.options import (
     add_layer_option,
     add_verb,
 )
-from shmmap.cli.program import complain
+from shmmap.cli.program import hint_if_interrupted
 from shmmap.cli.screens.output import (
     counted,
     format_bytes,
@@ -200,7 +200,7 @@ def _publish(args: argparse.Namespace) -> int:
     origin = origin_at(args, cache_dir)
     catalogue = origin.load(fresh=True)
     signer = signer_at(store, args, make_keys=True)
-    try:
+    with hint_if_interrupted("the same command continues"):
         done = publish_map(
             catalogue,
             store,
@@ -218,9 +218,6 @@ def _publish(args: argparse.Namespace) -> int:
             signer=signer,
             progress=progress_on_stderr(args),
         )
-    except KeyboardInterrupt:
-        complain("shmmap", "interrupted", "the same command continues")
-        raise
     notes = [*catalogue.problems, *done.notes]
     return _report(args, origin.path, store.url, done, notes, time.monotonic() - began_s)
 

@@ -108,7 +108,7 @@ def made(tmp_path: Path) -> DividedMap:
 
 def finish_change(one: InnerDaemon) -> None:
     """Do the rest of a change."""
-    while one.map_switch.busy:
+    while one.map_switch.next_s <= one.now_s():
         one.map_switch.run_step(one.now_s())
 
 

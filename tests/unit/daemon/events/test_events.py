@@ -320,7 +320,7 @@ def changed(**what: Any) -> LiveMapRow:
 
 def test_each_change_is_published_once() -> None:
     one = Published()
-    one.events.begin(1)
+    one.events.begin(1, ())
     assert one.take() == [(e.LiveStarted, 1, 0)]
     one.events.update((ROW,))
     one.events.update((changed(scans=12),))
@@ -342,8 +342,7 @@ def test_each_change_is_published_once() -> None:
 
 def test_a_worker_that_ends_and_the_next_one() -> None:
     one = Published()
-    one.events.begin(1)
-    one.events.update((changed(damaged=("a",)),))
+    one.events.begin(1, (changed(damaged=("a",)),))
     one.take()
     one.events.ended(1)
     one.events.started(1, 5)
@@ -356,9 +355,10 @@ def test_nothing_is_published_before_the_start() -> None:
     """What was found by then is published after it."""
     one = Published()
     one.events.started(1, 3)
-    one.events.update((changed(problem="chunk 0_0_0 cannot be loaded: torn", damaged=("a",)),))
+    found = changed(problem="chunk 0_0_0 cannot be loaded: torn", damaged=("a",))
+    one.events.update((found,))
     assert one.take() == []
-    one.events.begin(1)
+    one.events.begin(1, (found,))
     assert one.take() == [
         (e.LiveStarted, 1, 3), (e.LiveDamaged, "lidar", "a"),
         (e.LiveProblem, "lidar", "chunk 0_0_0 cannot be loaded: torn"),

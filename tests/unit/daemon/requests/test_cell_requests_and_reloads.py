@@ -158,7 +158,7 @@ def test_a_reload_checks_the_segments_of_what_changed(inner: Inner, small_map: D
     small_map.write_metadata()
     one.reload()
     assert one.cache.unentered == (32 if what in ("removed", "all") else 2)
-    while one.map_switch.busy:
+    while one.map_switch.next_s <= one.now_s():
         one.map_switch.run_step(one.now_s())
     residents = list(one.ledger.residents())
     warm = {resident for table in one.cache.warm.layers.values() for resident in table.values()}

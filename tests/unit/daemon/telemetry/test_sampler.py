@@ -18,6 +18,7 @@ from shmmap.daemon.telemetry.sampler import (
     Sampler,
 )
 from shmmap.daemon.turns import WatchedDescriptors
+from shmmap.statistics.counters import SPANS, WINDOWED
 from tests.support.divided_map import DividedMap
 from tests.unit.daemon.inner_daemon import Inner, InnerDaemon
 
@@ -116,17 +117,25 @@ def test_what_limits_prefetching(inner: Inner, small_map: DividedMap) -> None:
     assert (off.statistics.values["prefetch_budget_bytes"], off.statistics.values["prefetch_short"]) == (0, 0)
 
 
+def counted(hits: int) -> dict[str, int]:
+    """Counters, two of which are not 0."""
+    return {**dict.fromkeys(WINDOWED, 0), "hits": hits, "misses": -hits}
+
+
 @given(st.lists(st.tuples(st.floats(0.01, 30.0), st.integers(0, 5)), max_size=200))
 def test_growth_over_a_span_is_right_to_a_second(steps: list[tuple[float, int]]) -> None:
-    recent = RecentCounts(("hits",), (10.0, 60.0))
+    recent = RecentCounts()
     now_s, total = 100.0, 3
     history = [(now_s, total)]
-    recent.look({"hits": total}, now_s)
+    recent.look(counted(total), now_s)
     for wait_s, more in steps:
         now_s, total = now_s + wait_s, total + more
         history.append((now_s, total))
-        recent.look({"hits": total}, now_s)
-        for span, (growth,) in zip((10.0, 60.0), recent.growth({"hits": total}, now_s), strict=True):
+        recent.look(counted(total), now_s)
+        found = recent.growth(counted(total), now_s)
+        assert all(found[f"misses_{name}"] == -found[f"hits_{name}"] for name in SPANS)
+        for name, span in SPANS.items():
+            growth = found[f"hits_{name}"]
             inside = total - max((v for t, v in history if t <= now_s - span), default=3)
             early = [t for t, _ in history if t <= now_s - span]
             # a look less than a second after the one before is not remembered
@@ -135,7 +144,7 @@ def test_growth_over_a_span_is_right_to_a_second(steps: list[tuple[float, int]])
 
 
 def test_the_longest_span_is_remembered() -> None:
-    recent = RecentCounts(("hits",), (600.0,))
+    recent = RecentCounts()
     for second in range(2000):
-        recent.look({"hits": second}, float(second))
-    assert recent.growth({"hits": 1999}, 1999.0) == [(600,)]
+        recent.look(counted(second), float(second))
+    assert recent.growth(counted(1999), 1999.0)["hits_10min"] == 600

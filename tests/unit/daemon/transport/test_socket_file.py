@@ -62,7 +62,7 @@ def test_a_socket_left_over_is_replaced(place: Path) -> None:
     with socket.socket(socket.AF_UNIX) as left:
         left.bind(str(place))
     one = SocketFile(str(place), -1)
-    with closing(one):
+    with closing(one.socket):
         assert stat.S_IMODE(place.stat().st_mode) == 0o600
         there = one.is_there
         assert there
@@ -101,7 +101,7 @@ def test_a_stale_socket_of_another_user(place: Path) -> None:
 
 
 def test_a_link_is_no_socket(place: Path, tmp_path: Path) -> None:
-    with closing(SocketFile(str(tmp_path / "other.sock"), -1)):
+    with closing(SocketFile(str(tmp_path / "other.sock"), -1).socket):
         place.symlink_to(tmp_path / "other.sock")
         with pytest.raises(CannotStart, match="symbolic link"):
             SocketFile(str(place), -1)

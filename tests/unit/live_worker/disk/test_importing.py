@@ -47,7 +47,7 @@ def test_all_of_it_is_imported_and_kept(old: Path) -> None:
         assert database.rows.keys() == chunks.keys()
         assert {key: saved_bytes(old, key) for key in chunks} == chunks
         assert all(database.load(key) for key in chunks)
-        assert (database.lost, database.record.applied) == ({}, {1: 2})
+        assert (database.record.lost_chunks, database.record.applied) == ({}, {1: 2})
         assert [(one.number, one.uid, one.name, one.scans) for one in database.record.mappers] == [
             (1, 1000, "front", 1 << 20)
         ]
@@ -71,7 +71,7 @@ def test_what_has_the_name_already_stays(old: Path, kind: str) -> None:
         there /= next(name for name in before if name.endswith(".chunk"))
     there.write_bytes(b"precious")
     with opened(old) as database:
-        assert not database.lost
+        assert not database.record.lost_chunks
     assert there.read_bytes() == b"precious"
     assert contents(old / "imported.2") == before
 
@@ -90,8 +90,8 @@ def test_the_newest_good_one_of_each_chunk_counts(old: Path) -> None:
     with opened(old) as database:
         assert saved_bytes(old, first) == data
         assert saved_bytes(old, second) == newer
-        assert (list(database.lost), database.rows.get(third)) == ([third], None)
-        assert database.lost[third].version == read_file_header(other).version
+        assert (list(database.record.lost_chunks), database.rows.get(third)) == ([third], None)
+        assert database.record.lost_chunks[third].version == read_file_header(other).version
 
 
 def gone(path: Path, _other: Path) -> None:
@@ -116,10 +116,10 @@ def test_what_was_lost_has_its_name(old: Path, damage: Callable[[Path, Path], No
         (old / "manifest.json").unlink()
     lost = {ChunkKey.from_text(path.stem)} if manifest or damage is not gone else set()
     with opened(old) as database:
-        assert database.lost.keys() == lost
+        assert database.record.lost_chunks.keys() == lost
         assert database.rows.keys() == chunks.keys() - {ChunkKey.from_text(path.stem)}
     with opened(old) as again:
-        assert again.lost.keys() == lost
+        assert again.record.lost_chunks.keys() == lost
 
 
 def test_what_was_lost_before_is_lost(old: Path) -> None:
@@ -128,7 +128,7 @@ def test_what_was_lost_before_is_lost(old: Path) -> None:
     manifest["missing"] = {key: {**manifest["chunks"][key], "version": 900}}
     (old / "manifest.json").write_text(json.dumps(manifest))
     with opened(old) as database:
-        assert {one.text: lost.version for one, lost in database.lost.items()} == {key: 900}
+        assert {one.text: lost.version for one, lost in database.record.lost_chunks.items()} == {key: 900}
 
 
 @pytest.mark.parametrize("text", [b"{", b"[" * 200_000, b"\xff", b""])
@@ -217,7 +217,7 @@ def test_killed_at_any_step_it_is_imported_by_the_next_start(
             folder.close()
         with opened(directory) as database:
             assert database.rows.keys() == chunks.keys()
-            assert not database.lost
+            assert not database.record.lost_chunks
             assert {key: saved_bytes(directory, key) for key in chunks} == chunks
         assert contents(directory / "imported.1") == before
         assert files_of(directory) == {"map.db", "map.json", "imported.1"}

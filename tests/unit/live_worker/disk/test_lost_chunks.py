@@ -266,7 +266,7 @@ def test_tables_that_are_damaged_while_all_of_it_is_in_memory(damaged: Damaged) 
         assert connection is not None
         connection.execute("pragma shrink_memory")  # else what was read before is not read again
     damaged.answer(served, "disk")
-    served.until(lambda: served.paged.all_durable and not served.paged.database.lost, save_all=True)
+    served.until(lambda: served.paged.all_durable and not served.paged.database.record.lost, save_all=True)
     assert damaged.answer(served, "disk") == damaged.answer(served, "all") == (set(), damaged.voxels)
     served.end()
     assert damaged.checked().good

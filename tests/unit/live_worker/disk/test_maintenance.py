@@ -75,7 +75,7 @@ def assert_found_and_put_aside(directory: Path, key: ChunkKey, damaged: bytes) -
     assert found.rebuilt_from in again.aside
     with closing(Folder(directory)) as folder, closing(MapDatabase(folder, SETTINGS)) as database:
         assert database.rows == again.rows
-        assert not database.lost
+        assert not database.record.lost_chunks
 
 
 def test_a_chunk_that_contradicts_itself(tmp_path: Path) -> None:

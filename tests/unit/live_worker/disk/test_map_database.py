@@ -29,7 +29,7 @@ from shmmap.live_worker.disk import map_database, schema
 from shmmap.live_worker.disk.folder import Folder, FolderToRead
 from shmmap.live_worker.disk.maintenance import CheckedMap, check, repair
 from shmmap.live_worker.disk.map_database import SCANS_AHEAD, MapDatabase
-from shmmap.live_worker.disk.map_record import MapSettings, Row
+from shmmap.live_worker.disk.map_record import Lost, MapSettings, Row
 from shmmap.live_worker.disk.rebuilding import NEW, finish_replacing, replace_database
 from shmmap.live_worker.disk.stored_map import opened_folder_to_read
 from shmmap.mounts import Mount
@@ -111,7 +111,7 @@ def test_a_map_is_made_and_found_again(tmp_path: Path) -> None:
         assert again.rows == {KEYS[0]: Row(3, 2688, 0, 0, 0, 0), KEYS[1]: Row(1, 2688, 0, 0, 0, 0)}
         assert again.record.applied == {1: 7}
         assert [version_of(again, key) for key in KEYS] == [3, 1, 0]
-        assert (again.lost, again.damaged) == ({}, {})
+        assert (again.record.lost_chunks, again.damaged) == ({}, {})
 
 
 def test_a_database_is_on_the_disk_before_it_gets_its_name(
@@ -256,7 +256,7 @@ def test_a_copy_that_is_taken_while_it_is_written(tmp_path: Path) -> None:
                     made.bring_log_in()
             with opened(other) as again:
                 for key in KEYS:
-                    assert version_of(again, key) or key in again.lost, (version, key)
+                    assert version_of(again, key) or key in again.record.lost_chunks, (version, key)
                     again.save(key, chunk(again, key, 1000))
 
 
@@ -358,7 +358,7 @@ def test_saving_and_reading_beside_the_log_brought_in(
         for one in threads:
             one.join()
         assert not failed
-        assert (made.lost, made.damaged) == ({}, {})
+        assert (made.record.lost_chunks, made.damaged) == ({}, {})
 
 
 # --- damage -------------------------------------------------------------------------------------
@@ -375,15 +375,30 @@ def test_a_damaged_chunk_stays_and_is_saved_beside(tmp_path: Path) -> None:
         change_chunk(tmp_path, KEYS[0], flipped)
         damaged = saved_bytes(tmp_path, KEYS[0])
         assert made.load(KEYS[0]) is None
-        assert (list(made.lost), list(made.found_lost)) == ([KEYS[0]], [KEYS[0]])
+        assert (list(made.record.lost_chunks), list(made.found_lost)) == ([KEYS[0]], [KEYS[0]])
         made.note_remade(KEYS[0])
         made.save(KEYS[0], chunk(made, KEYS[0], 1))
         with database(tmp_path) as reader:
             assert (damaged,) in reader.execute("select data from chunks").fetchall()
     with opened(tmp_path) as again:
         assert [version_of(again, key) for key in KEYS] == [1, 2, 2]
-        assert again.lost[KEYS[0]].version == 2
+        assert again.record.lost_chunks[KEYS[0]].version == 2
         assert KEYS[0].text in again.losses(9)[0][0]
+
+
+def test_what_was_lost_before_has_its_name_where_tables_are_damaged_at_the_start(tmp_path: Path) -> None:
+    """The record can be read, only the rows cannot; and nothing else of that chunk is left."""
+    lost = {KEYS[1].text: Lost(3, "it was on a page that is gone")}
+    with opened(tmp_path) as made:
+        made.save(KEYS[0], chunk(made, KEYS[0], 2))
+        made.record.lost.update(lost)
+        made.write_record()
+    with database(tmp_path) as writer:
+        writer.execute("insert into chunks(key) values('no key')")
+    with opened(tmp_path) as again:
+        assert list(again.damaged) == ["map.db.damaged.1"]
+        assert version_of(again, KEYS[0]) == 2
+        assert (again.record.lost, list(again.found_lost)) == (lost, [])
 
 
 @pytest.fixture
@@ -425,14 +440,14 @@ def check_after_damage(
         found = loaded(made, saved)
         lost = {key for key, data in found.items() if data != saved[key]}
         assert len(lost) <= most, what
-        lost = {key for key in lost if key in made.lost or key not in unnamed}
-        assert lost == made.lost.keys(), what
+        lost = {key for key in lost if key in made.record.lost_chunks or key not in unnamed}
+        assert lost == made.record.lost_chunks.keys(), what
         for key in saved:
             made.save(key, saved[key])
         made.write_record()
         assert loaded(made, saved) == saved, what
     with opened(directory) as again:
-        assert again.lost.keys() == lost
+        assert again.record.lost_chunks.keys() == lost
         assert again.rows.keys() == saved.keys()
 
 
@@ -475,12 +490,12 @@ def test_a_page_is_damaged_while_the_map_is_used(tmp_path: Path, any_body: None,
                 made.save(key, saved[key])
             found = loaded(made, saved)
             lost = {key for key, data in found.items() if data != saved[key]}
-            named = set(made.lost)
+            named = set(made.record.lost_chunks)
             assert lost <= named == set(made.found_lost), number  # some were saved again since
             assert len(named) <= 4, number
             made.write_record()
         with opened(copy) as again:
-            assert again.lost.keys() == named, number
+            assert again.record.lost_chunks.keys() == named, number
             assert {key for key, data in loaded(again, saved).items() if data != saved[key]} == lost
         shutil.rmtree(copy)
 
@@ -531,7 +546,7 @@ def test_a_damaged_page_of_the_log_costs_at_most_four_chunks(
         # the chunk saved last may have its name on that page alone
         check_after_damage(copy, saved, 4, (damage, number), unnamed={list(saved)[-1]})
         with opened(copy) as made:
-            assert {one.chunk for one in found.lost} == {key.text for key in made.lost}, number
+            assert {one.chunk for one in found.lost} == {key.text for key in made.record.lost_chunks}, number
         assert (copy / "map.db.damaged.1-wal").stat().st_size == len(log)
         shutil.rmtree(copy)
 
@@ -661,7 +676,7 @@ def test_a_disk_too_full_for_a_rebuild_is_tried_again(
                     made.flush()
                 assert "map.db.new" not in files_of(tmp_path), "it takes no room"
         assert loaded(made, saved) == saved
-        assert made.lost == {}
+        assert made.record.lost_chunks == {}
         made.flush()
     assert "map.db.new" not in files_of(tmp_path)
 
