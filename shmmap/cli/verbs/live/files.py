@@ -165,7 +165,7 @@ def _print_fsck(found: CheckedMap) -> None:
     if found.damaged:
         print_line(f"damaged: {found.damaged}")
     for name, why in found.unknown.items():
-        print_line(f"unknown: what else {name} had: {why}")
+        print_line(f"unknown: {name} may have had more chunks: {why}")
     for lost in found.lost:
         now = f"version {lost.found} is there" if lost.found else "nothing is there"
         print_line(f"lost: chunk {lost.chunk}: version {lost.version} was saved, {now}: {lost.reason}")
