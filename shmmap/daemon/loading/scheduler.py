@@ -40,12 +40,14 @@ from shmmap.daemon.loading.worker_messages import (
     Compiling,
     Done,
     Failed,
+    FromWorker,
     Job,
     Need,
 )
 from shmmap.daemon.loading.worker_pool import NOT_OPENED, Opened, Worker, WorkerPool
 from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.records import SPACE_CODES, Absent, Failure, Key, Resident, failure_code
+from shmmap.daemon.turns import Walk
 from shmmap.errors import Replaced
 from shmmap.failpoints import step
 from shmmap.installed import RESTART, is_replaced
@@ -403,18 +405,21 @@ class Scheduler:
     # --- messages of workers -----------------------------------------------------------------------
 
     def on_worker(self, worker: Worker, now_s: float) -> None:
-        """Handle one message of a worker."""
+        """Handle a worker's messages that are here, for a step's time."""
         try:
-            message = self.pool.next_message(worker, now_s)
+            for message in Walk(self.pool.messages(worker, now_s)).for_a_step():
+                self._on_message(worker, message, now_s)
         except EOFError as error:
             self.lost.ended(worker, str(error), now_s)
-            return
+
+    def _on_message(self, worker: Worker, message: FromWorker, now_s: float) -> None:
         if isinstance(message, Begun):
             self.pool.works_on(worker, message.number, now_s)
         elif isinstance(message, Arrived):
             if self.link is not None:
                 self.link.arrived(message.bytes, now_s, message.delays_s)
-                self.link.end(self._jobs.get(message.fetched), message.fetched_bytes)
+                for number, nbytes in message.fetched:
+                    self.link.end(self._jobs.get(number), nbytes)
         elif isinstance(message, Compiling):
             worker.compiling = True
         elif isinstance(message, Need):

@@ -314,6 +314,11 @@ class WorkerPool:
 
     # --- messages --------------------------------------------------------------------------
 
+    def messages(self, worker: Worker, now_s: float) -> Iterator[worker_messages.FromWorker]:
+        """Yield a worker's messages that are here; raises as `next_message`."""
+        while (message := self.next_message(worker, now_s)) is not None:
+            yield message
+
     def next_message(self, worker: Worker, now_s: float) -> worker_messages.FromWorker | None:
         """Return a worker's next message about its jobs; None if there is none now.
 
