@@ -109,8 +109,9 @@ class MapSwitch:
             self._check(segments, len(segments))
         else:
             self._leftovers += cache.serve(new, change)
-            self._to_free = self._to_free or Walk(self._free_leftovers())
             self.recheck()
+        self._leftovers.append(change)  # with the state before it
+        self._to_free = self._to_free or Walk(self._free_leftovers())
 
     def _is_small(self, change: CatalogueChange) -> bool:
         """Whether only the segments of changed cells have to be checked, and these can be found at once."""
