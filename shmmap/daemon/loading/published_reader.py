@@ -95,7 +95,7 @@ class _Reports:
         self.send()
 
     def note_fetched(self, number: int, nbytes: int) -> None:
-        """Note that a job needs the origin no more, and the bytes that came for it; `send` follows."""
+        """Note that a job needs the origin no more, and the bytes of it that came; a report is to follow."""
         with self._lock:
             self._fetched[number] = nbytes
 
