@@ -179,11 +179,11 @@ class Scheduler:
         needed_bytes: Callable[[Job], int] | None = None,
     ) -> None:
         self._cache, self._map_switch, self._load_finished = cache, map_switch, load_finished
-        self._ledger, self._layers = cache.ledger, cache.layers
+        self._clock, self._ledger, self._layers = clock, cache.ledger, cache.layers
         self._events, self._statistics = cache.events, cache.statistics
         self.link, self._needed_bytes, self._link_s = link, needed_bytes, math.inf
         self.loads = Loads(cache.ledger, link)
-        self.pool = pool = make_pool(lambda worker: self.on_worker(worker, clock()))
+        self.pool = pool = make_pool(self._on_worker)
         self._jobs: dict[int, Load] = {}
         self._to_recheck: deque[Key] = deque()
         self._for_pages: dict[Load, None] = {}  # loads that wait until the cells they read are known
@@ -404,13 +404,13 @@ class Scheduler:
 
     # --- messages of workers -----------------------------------------------------------------------
 
-    def on_worker(self, worker: Worker, now_s: float) -> None:
+    def _on_worker(self, worker: Worker) -> None:
         """Handle a worker's messages that are here, for a step's time."""
         try:
-            for message in Walk(self.pool.messages(worker, now_s)).for_a_step():
-                self._on_message(worker, message, now_s)
+            for message in Walk(self.pool.messages(worker, self._clock)).for_a_step():
+                self._on_message(worker, message, self._clock())
         except EOFError as error:
-            self.lost.ended(worker, str(error), now_s)
+            self.lost.ended(worker, str(error), self._clock())
 
     def _on_message(self, worker: Worker, message: FromWorker, now_s: float) -> None:
         if isinstance(message, Begun):

@@ -314,9 +314,9 @@ class WorkerPool:
 
     # --- messages --------------------------------------------------------------------------
 
-    def messages(self, worker: Worker, now_s: float) -> Iterator[worker_messages.FromWorker]:
+    def messages(self, worker: Worker, clock: Callable[[], float]) -> Iterator[worker_messages.FromWorker]:
         """Yield a worker's messages that are here; raises as `next_message`."""
-        while (message := self.next_message(worker, now_s)) is not None:
+        while (message := self.next_message(worker, clock())) is not None:
             yield message
 
     def next_message(self, worker: Worker, now_s: float) -> worker_messages.FromWorker | None:
