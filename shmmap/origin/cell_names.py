@@ -18,9 +18,9 @@ from shmmap.errors import BadRequest
 
 Names = NDArray[np.bytes_]
 
-# Number of cached lookups; differential requests repeat the same few hundred ids.  A dict of four times as
-# many takes 2 ms to grow or to clear.
-_REMEMBERED = 1 << 14
+# Number of cached lookups: differential requests repeat the same ids, a few hundred or all 20 000 that a
+# request may hold.  A dict of three times as many takes 2 ms to grow or to clear.
+_REMEMBERED = 20_480
 _NAMED_IN_ERRORS = 3
 
 # Names converted to Python objects at a time; ten million would take a gigabyte.

@@ -110,7 +110,7 @@ class MapSwitch:
         else:
             self._leftovers += cache.serve(new, change)
             self.recheck()
-        self._leftovers.append(change)  # with the state before it
+        self._leftovers.append(change.old)
         self._to_free = self._to_free or Walk(self._free_leftovers())
 
     def _is_small(self, change: CatalogueChange) -> bool:

@@ -78,13 +78,12 @@ def needed_bytes(job: worker_messages.Job) -> int:
 
 
 class _Reports:
-    """Reports bytes and jobs' data as they come, not more often than the daemon needs that."""
+    """Reports bytes as they come, not more often than the daemon needs them."""
 
     def __init__(self, report: Report) -> None:
         self._report = report
         self._lock = threading.Lock()
         self._bytes, self._delays_s = 0, list[float]()
-        self._fetched: dict[int, int] = {}
         self._sent_s = -math.inf
 
     def add(self, nbytes: int, delay_s: float | None) -> None:
@@ -92,30 +91,18 @@ class _Reports:
         with self._lock:
             self._bytes += nbytes
             self._delays_s += [delay_s] if delay_s is not None else []
-        self.send()
-
-    def note_fetched(self, number: int, nbytes: int) -> None:
-        """Note that a job needs the origin no more, and the bytes of it that came; a report is to follow."""
-        with self._lock:
-            self._fetched[number] = nbytes
-
-    def send(self, *, at_once: bool = False) -> None:
-        """Report what has been noted; unless ``at_once``, not soon after the last report."""
-        with self._lock:
-            if at_once or time.monotonic() >= self._sent_s + REPORTED_S:
+            if time.monotonic() >= self._sent_s + REPORTED_S:
                 self._send()
 
-    def begins(self, number: int) -> None:
-        """Report at once what has come if a job's data is among it: the job may end soon."""
+    def fetched(self, number: int, nbytes: int) -> None:
+        """Report that a job needs the origin no more, for which this many bytes have come."""
         with self._lock:
-            if number in self._fetched:
-                self._send()
+            self._send(number, nbytes)
 
-    def _send(self) -> None:
-        fetched = tuple(self._fetched.items())
-        self._report(worker_messages.Arrived(self._bytes, tuple(self._delays_s), fetched))
-        self._bytes, self._delays_s, self._fetched = 0, [], {}
+    def _send(self, fetched: int = 0, fetched_bytes: int = 0) -> None:
         self._sent_s = time.monotonic()
+        self._report(worker_messages.Arrived(self._bytes, tuple(self._delays_s), fetched, fetched_bytes))
+        self._bytes, self._delays_s = 0, []
 
 
 def _get(objects: KeptObjects, name: ObjectName) -> memoryview:
@@ -187,10 +174,9 @@ class ObjectFetcher:
                 os.eventfd_read(self.fd)
             except BlockingIOError:
                 return None
-            number = self._at_work = self._done.popleft()
+            self._at_work = self._done.popleft()
             self._begin_some()
-        self._reports.begins(number)
-        return number
+            return self._at_work
 
     def get(self, name: ObjectName) -> memoryview:
         """Return an object that was fetched for the current job, or fetch it now."""
@@ -225,8 +211,6 @@ class ObjectFetcher:
                 while self._queue:
                     self._fetch_ended(self._queue.popleft(), frame)
             self._begin_some()
-            is_last = not self._under_way
-        self._reports.send(at_once=is_last)
 
     def _watch(self) -> None:
         """Look for slow objects until nothing is queued, in a thread."""
@@ -254,7 +238,7 @@ class ObjectFetcher:
     def _finish_if_complete(self, number: int) -> None:
         fetches = [self._fetches[digest] for digest in self._needs[number]]
         if all(fetch.frame is not None for fetch in fetches):
-            self._reports.note_fetched(number, sum(fetch.received for fetch in fetches))
+            self._reports.fetched(number, sum(fetch.received for fetch in fetches))
             for fetch in fetches:
                 fetch.received = 0
             self._done.append(number)

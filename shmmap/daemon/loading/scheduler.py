@@ -418,8 +418,7 @@ class Scheduler:
         elif isinstance(message, Arrived):
             if self.link is not None:
                 self.link.arrived(message.bytes, now_s, message.delays_s)
-                for number, nbytes in message.fetched:
-                    self.link.end(self._jobs.get(number), nbytes)
+                self.link.end(self._jobs.get(message.fetched), message.fetched_bytes)
         elif isinstance(message, Compiling):
             worker.compiling = True
         elif isinstance(message, Need):

@@ -94,12 +94,13 @@ class Begun(msgspec.Struct, array_like=True, tag="begun"):
 class Arrived(msgspec.Struct, array_like=True, tag="arrived"):
     """Report bytes that have come from the origin since the last report, and after how long answers began.
 
-    ``fetched`` are the numbers of jobs that need the origin no more, each with the bytes that came for it.
+    ``fetched`` is the number of a job that needs the origin no more, for which ``fetched_bytes`` have come.
     """
 
     bytes: int
     delays_s: tuple[float, ...] = ()
-    fetched: tuple[tuple[int, int], ...] = ()
+    fetched: int = 0
+    fetched_bytes: int = 0
 
 
 class Compiling(msgspec.Struct, array_like=True, tag="compiling"):

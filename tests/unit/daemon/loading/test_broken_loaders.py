@@ -11,6 +11,7 @@ from collections.abc import Iterator
 
 import pytest
 
+from shmmap.daemon import turns
 from shmmap.daemon.loading import lost_workers, worker_messages
 from shmmap.daemon.loading.worker_pool import Worker
 from shmmap.daemon.records import Key
@@ -106,6 +107,32 @@ def test_what_a_dead_loader_had_finished_counts(puppet: Puppet) -> None:
     (failure,) = reply.failed
     assert second.source.name in failure.message, "the second is what it died of"
     assert one.cache.wire_id(first.cell_id) in [cell.id for cell in reply.cells]
+    assert len(reply.cells) == 3
+
+
+def test_what_a_loader_has_said_is_handled_in_order_in_one_step(
+    puppet: Puppet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its death, the last of it, is blamed on the job that it began last."""
+    monkeypatch.setattr(turns, "STEP_S", 60.0)
+    one = puppet.one
+    puppet.worker.fetches = True
+    ask(one, 1)
+    first, second = puppet.queue(4)[:2]
+    puppet.process.kill()
+    for message in (
+        worker_messages.Begun(first.number),
+        puppet.done(first),
+        worker_messages.Begun(second.number),
+    ):
+        puppet.say(message)
+    puppet.say(worker_messages.Ended(-11))
+    one.pool.on_message(puppet.worker)
+    assert puppet.worker not in list(one.pool)
+    assert [resident.key.cell_id for resident in one.ledger.segments.walk()] == [first.cell_id]
+    reply = one.cells_of(1)
+    (failure,) = reply.failed
+    assert second.source.name in failure.message
     assert len(reply.cells) == 3
 
 

@@ -115,41 +115,14 @@ def test_bytes_that_come_at_the_same_time_are_all_reported(monkeypatch: pytest.M
         monkeypatch.setattr(published_reader, "REPORTED_S", 0.0)
         return reports
 
-    def send(reports: _Reports) -> None:
-        reports.send()
+    def fetched(reports: _Reports) -> None:
+        reports.fetched(1, 3)
 
-    for first in (one_byte, send):
+    for first in (one_byte, fetched):
         for reports in interleaved(after_one, first, one_byte):
-            send(reports)
+            fetched(reports)
             assert sum(message.bytes for message in sent) == 3 + (first is one_byte)
             sent.clear()
-
-
-def test_fetched_data_is_reported_once_and_before_its_job_begins(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(published_reader, "REPORTED_S", 1e9)
-    sent: list[Arrived] = []
-
-    def two_fetched() -> _Reports:
-        sent.clear()
-        reports = _Reports(cast("Any", sent.append))
-        reports.add(7, None)
-        reports.note_fetched(1, 3)
-        reports.note_fetched(2, 4)
-        assert [message.fetched for message in sent] == [()]
-        return reports
-
-    def begins(reports: _Reports) -> None:
-        reports.begins(1)
-        assert (1, 3) in [one for message in sent for one in message.fetched]
-
-    def send(reports: _Reports) -> None:
-        reports.send(at_once=True)
-
-    for reports in interleaved(two_fetched, send, begins):
-        begins(reports)
-        reports.begins(2)
-        assert sorted(one for message in sent for one in message.fetched) == [(1, 3), (2, 4)]
-        assert sum(message.bytes for message in sent) == 7
 
 
 Move = Callable[[ObjectFetcher], object]
@@ -169,7 +142,7 @@ class Loader:
         self._monkeypatch.setattr(published_reader, "SLOW_S", 1e9)
         fetcher = ObjectFetcher(cast("Any", Objects()))
         fetcher._threads = cast("Any", self)
-        fetcher._reports = cast("Any", SimpleNamespace(note_fetched=pow, send=dict, begins=abs))
+        fetcher._reports = cast("Any", SimpleNamespace(fetched=pow))
         for number in range(1, 5):
             begin(fetcher, number, b"%d" % number, self._monkeypatch, MAX_BYTES // 2)
         self._submitted.popleft()()
