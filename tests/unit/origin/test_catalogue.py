@@ -12,9 +12,11 @@ import xxhash
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from shmmap.daemon.requests.limits import MAX_HELD
 from shmmap.errors import BadRequest, MapDataError
 from shmmap.geometry import Circle
 from shmmap.origin.catalogue import Catalogue, compare
+from shmmap.origin.cell_names import CellNames
 from shmmap.segment.layout import SourceStamp
 
 Box = tuple[float, float, float, float]
@@ -62,6 +64,16 @@ def test_find_by_id_and_base_name() -> None:
     assert cells.find("3/a.pcd") is None
     with pytest.raises(BadRequest, match=r"2 cells are called a\.pcd: /m/1/a\.pcd, /m/2/a\.pcd"):
         cells.find("a.pcd")
+
+
+def test_all_cells_that_a_request_may_hold_are_looked_up_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A lookup takes thirty times as long as to remember it."""
+    names = np.array([b"%05d.pcd" % number for number in range(MAX_HELD)])
+    cells = CellNames("/m/", names)
+    held = cells.ids(np.arange(MAX_HELD))
+    assert [cells.find(cell) for cell in held] == list(range(MAX_HELD))
+    monkeypatch.setattr(cells, "_find_id", None)
+    assert [cells.find(cell) for cell in held] == list(range(MAX_HELD))
 
 
 def test_an_id_without_its_prefix_is_no_ambiguous_base_name() -> None:
