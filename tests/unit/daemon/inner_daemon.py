@@ -124,6 +124,8 @@ class InnerDaemon:
             if early is not None:
                 early[1].close()
                 early[0].wait(TIMEOUT_S)
+            self.directory.close()
+            os.rmdir(self.shm_dir)
             raise
         self.cache, self.scheduler, self.sessions = memory.cache, memory.scheduler, memory.sessions
         self.statistics, self.event_log, self.watched = memory.statistics, memory.event_log, memory.watched
