@@ -138,8 +138,8 @@ def test_a_metered_link_fetches_nothing_for_a_spare_request(inner: Inner, small_
 def test_a_loader_that_is_killed_leaves_nothing_under_way(inner: Inner, small_map: DividedMap) -> None:
     link = Link(Arrivals())
     one = inner(small_map.root, link=link)
-    one.ask(one.session(), Selected(1, (CELL,), wait=30.0))
     with one.loaders_standing_still() as pids:
+        one.ask(one.session(), Selected(1, (CELL,), wait=30.0))
         one.run_until(lambda: link.under_way_bytes == FETCHED_BYTES)
         for pid in pids:
             os.kill(pid, signal.SIGKILL)
