@@ -153,7 +153,7 @@ class MapSwitch:
                 self._unseen, cache.unentered = None, 0
 
     def _free_leftovers(self) -> Iterator[None]:
-        """Free unused tables, one entry or array per step: freeing more at once takes long."""
+        """Free unused tables and the state before, one entry or object per step: more at once takes long."""
         while self._leftovers:
             table = self._leftovers.pop()
             while isinstance(table, ShardedDict) and table:

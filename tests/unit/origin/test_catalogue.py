@@ -67,7 +67,7 @@ def test_find_by_id_and_base_name() -> None:
 
 
 def test_all_cells_that_a_request_may_hold_are_looked_up_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A lookup takes thirty times as long as to remember it."""
+    """Looking an id up takes thirty times as long as remembering its index."""
     names = np.array([b"%05d.pcd" % number for number in range(MAX_HELD)])
     cells = CellNames("/m/", names)
     held = cells.ids(np.arange(MAX_HELD))

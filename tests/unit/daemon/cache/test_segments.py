@@ -7,6 +7,7 @@ import gc
 import os
 import resource
 import select
+import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -140,6 +141,22 @@ def test_requests_meanwhile_are_answered_as_if_it_were_over(
     assert one.cache.unentered == 0
     assert "0_0.pcd" not in names(one.cells_for(Area(4, CircleMessage(1, 1, 2))))
     assert one.ledger.resident_count == CELLS - 1
+
+
+@pytest.mark.parametrize("is_small", [True, False])
+def test_the_state_before_a_change_is_freed_in_a_step_of_its_own(
+    inner: Inner, made: DividedMap, is_small: bool
+) -> None:
+    one = inner(str(made.root))
+    one.everything()
+    before = weakref.ref(one.cache.catalogue)
+    if is_small:
+        made.change("20_20.pcd", 3)
+    else:
+        remove(made, "20_20.pcd")
+    one.reload()
+    assert before() is not None
+    one.run_until(lambda: before() is None)
 
 
 @pytest.mark.usefixtures("short_steps")
